@@ -1,0 +1,57 @@
+"""The one shape of every command's line: a few flags of its own, then overrides of the project's settings.
+
+    python -m mitsuba_avatar.fit --config tiny training.iterations 50 model.decoder_channels=32,16
+
+Flags are the fields of a small dataclass, read by tyro; every other word is an override (`presets.resolve` says how it is written).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import tyro
+
+from mitsuba_avatar.presets import nearest_key, setting_types
+
+CommandType = TypeVar("CommandType")
+
+
+def parse_command(command: type[CommandType], settings: type, arguments: Sequence[str] | None = None) -> tuple[CommandType, list[str]]:
+    """Read a command line.
+
+    Args:
+        command: dataclass of the command's own flags; its docstring is the help text.
+        settings: the settings dataclass that overrides speak of (`Settings`, `StudioSettings`).
+        arguments: words after the command's name; None reads `sys.argv`.
+
+    Returns:
+        The flags, and the overrides as `presets.resolve` takes them: `command, overrides = parse_command(FitCommand, Settings)`.
+
+    Raises:
+        ValueError: a word that is neither flag nor setting; the message names the nearest of both.
+        SystemExit: after `--help`, or a flag of the wrong type (tyro prints which).
+    """
+    description = f"{(command.__doc__ or '').strip()}\n\nSettings, written KEY VALUE or KEY=VALUE (default):\n{_describe(settings)}"
+    flags, words = tyro.cli(command, args=arguments, description=description, return_unknown_args=True)
+    known = list(setting_types(settings))
+    own = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(command)]
+    is_value = False
+    for word in words:
+        if not is_value and word.removeprefix("--").partition("=")[0].replace("-", "_") not in known:
+            raise ValueError(
+                f"parse_command(): expected a flag or a setting; got {word!r}. Did you mean {nearest_key(word, known + own)!r}?"
+            )
+        is_value = not is_value and "=" not in word
+    return flags, words
+
+
+def _describe(settings: type) -> str:
+    """One line a setting: dotted key and default."""
+    return "\n".join(f"  {key} ({_default(settings, key)})" for key in setting_types(settings))
+
+
+def _default(settings: type, key: str) -> Any:
+    value: Any = settings()
+    for name in key.split("."):
+        value = getattr(value, name)
+    return value

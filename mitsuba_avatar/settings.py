@@ -1,0 +1,219 @@
+"""Every setting of the project: one frozen dataclass a section, read from YAML, overridden on the command line, saved with the run.
+
+Values out of range are refused as soon as a section is made, before any long work begins. Reading and writing is in `presets.py`.
+
+Units are SI (metres, radians, seconds) and pixels or texels unless a name says otherwise.
+"""
+
+import re
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+_RANGES = {
+    "positive": lambda value: value > 0,
+    "zero or more": lambda value: value >= 0,
+    "between 0 and 1": lambda value: 0 <= value <= 1,
+    "a power of two": lambda value: value > 0 and value & (value - 1) == 0,
+}
+
+
+def _expect(settings: Any, expectation: str, *names: str) -> None:
+    """Refuse a value outside its range; a tuple must have entries, each within the range."""
+    for name in names:
+        value = getattr(settings, name)
+        entries = value if isinstance(value, tuple) else (value,)
+        if not entries or not all(_RANGES[expectation](entry) for entry in entries):
+            raise ValueError(
+                f"{type(settings).__name__}(): expected {name} to be {expectation}; got {value}. Change it in the preset or override."
+            )
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """Which capture to learn from, and which of its images."""
+
+    path: str = ""  # capture folder; empty means the embedded default capture, filmed on first use
+    held_out_cameras: tuple[str, ...] = ()  # empty means the capture's own list
+    image_scale: float = 1.0  # images and cameras are resized by this factor when read
+
+    def __post_init__(self) -> None:
+        _expect(self, "positive", "image_scale")
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """Sizes of the conditional VAE (paper, sections 3.2 to 3.4). Sizes in texels are powers of two.
+
+    Widths of a branch are listed from coarse to fine, one a doubling of the map; where a size asks for more, the last is repeated.
+
+    Raises:
+        ValueError: if a size is no power of two, or sizes and lists of widths do not fit each other.
+    """
+
+    use_latent: bool = True  # False: no encoder, no z (the paper's pose+face baseline)
+    use_localization: bool = True  # False: the driving signal reaches every location of the conditioning maps
+    use_compression: bool = True  # False: masked signals enter the decoder without the two-layer projection
+    use_shadow: bool = True  # False: no ambient-occlusion-fed gain map
+    latent_size: int = 128  # entries of z (paper: 512)
+    conditioning_size: int = 32  # texels of the driving-signal maps e_theta, e_f (paper: 32)
+    latent_channels: tuple[int, ...] = (64, 48, 32)  # features from z, each a doubling on; the last at conditioning_size
+    pose_embedding_channels: int = 16  # of e_theta
+    face_embedding_channels: int = 8  # of e_f
+    decoder_channels: tuple[int, ...] = (64, 64)  # trunk: convolutions at conditioning_size, shared by geometry and texture
+    geometry_channels: tuple[int, ...] = (24,)  # features at 2x, 4x, ... conditioning_size, up to half of geometry_size
+    geometry_size: int = 128  # texels of the displacement map
+    texture_channels: tuple[int, ...] = (48, 16)  # features at 2x, 4x, ... conditioning_size, up to half of texture_size
+    texture_size: int = 256
+    view_channels: tuple[int, ...] = (16, 16)  # hidden features of the view branch, all at view_size
+    view_size: int = 64  # texels of what the camera's direction adds to the texture; at most half of texture_size
+    encoder_size: int = 128  # texels of the position map that the encoder reads
+    encoder_channels: tuple[int, ...] = (16, 24, 32, 48, 64)  # each entry halves the map
+    shadow_channels: tuple[int, ...] = (8, 16, 24)  # UNet levels; it runs at texture_size / shadow_downscale
+    shadow_downscale: int = 4  # paper: a quarter of the texture's resolution
+    displacement_scale: float = 0.02  # metres that one unit of decoder output moves a vertex
+    texture_scale: float = 0.2  # radiance that one unit of decoder output adds to the mean texture
+
+    def __post_init__(self) -> None:
+        _expect(self, "positive", "latent_size", "latent_channels", "pose_embedding_channels", "face_embedding_channels")
+        _expect(self, "positive", "decoder_channels", "geometry_channels", "texture_channels", "view_channels")
+        _expect(self, "positive", "encoder_channels", "shadow_channels", "displacement_scale", "texture_scale")
+        _expect(self, "a power of two", "conditioning_size", "geometry_size", "texture_size")
+        _expect(self, "a power of two", "view_size", "encoder_size", "shadow_downscale")
+        for name, least in (("geometry_size", 1), ("texture_size", 2), ("view_size", 1)):
+            if getattr(self, name) < least * self.conditioning_size:
+                raise ValueError(
+                    f"ModelSettings(): expected {name} to be at least {'conditioning_size' if least == 1 else 'twice conditioning_size'} "
+                    f"({least * self.conditioning_size}); got {getattr(self, name)}. Raise it, or lower conditioning_size."
+                )
+        if self.view_size > self.texture_size // 2:
+            raise ValueError(
+                f"ModelSettings(): expected view_size to be at most half of texture_size ({self.texture_size // 2}); got {self.view_size}. "
+                "Lower it."
+            )
+        halvings = (("latent", self.conditioning_size, 1), ("encoder", self.encoder_size, 0), ("shadow", self.shadow_size, 1))
+        for name, size, free in halvings:
+            widths = getattr(self, f"{name}_channels")
+            if size >> (len(widths) - free) < 1:
+                raise ValueError(
+                    f"ModelSettings(): expected {name}_channels to halve a map of {size} texels to no less than one; got {widths}. "
+                    "Use fewer entries."
+                )
+
+    @property
+    def shadow_size(self) -> int:
+        """Texels of the ambient-occlusion and gain maps."""
+        return self.texture_size // self.shadow_downscale
+
+
+@dataclass(frozen=True)
+class RenderingSettings:
+    """The differentiable surface renderer and ambient occlusion."""
+
+    variant: str = "auto"  # auto: cuda_ad_rgb where it works, llvm_ad_rgb otherwise
+    samples_per_pixel: int = 1  # primal rays per pixel, jittered
+    boundary_samples_per_edge: int = 2  # stratified positions on every contour edge
+    ambient_occlusion_rays: int = 64  # per texel
+    ambient_occlusion_distance: float = 0.6  # metres; hits farther away do not occlude
+
+    def __post_init__(self) -> None:
+        _expect(self, "positive", "samples_per_pixel", "boundary_samples_per_edge", "ambient_occlusion_rays", "ambient_occlusion_distance")
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Weights of the named loss terms (paper, section 3.6). A term with weight zero is not evaluated. Units: see training.losses."""
+
+    image: float = 1.0  # per unit of absolute colour difference, averaged over the foreground
+    mask: float = 0.5  # per fraction of the foreground that is covered wrongly
+    geometry: float = 1.0  # per square centimetre of mean squared vertex distance
+    laplacian: float = 1.0  # per square centimetre of mean squared difference of mesh Laplacians
+    kl: float = 1e-3  # per nat and pose, summed over the latent code
+    geometry_iterations: int = 300  # mesh supervision ends here (paper: 2000)
+    geometry_after: float = 0.02  # factor on `geometry` after that, 0 as in the paper
+
+    def __post_init__(self) -> None:
+        _expect(self, "zero or more", "image", "mask", "geometry", "laplacian", "kl", "geometry_iterations", "geometry_after")
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """The optimisation loop."""
+
+    iterations: int = 1200
+    poses_per_batch: int = 2  # batch size = poses_per_batch * views_per_pose (paper: 8)
+    views_per_pose: int = 4
+    learning_rate: float = 1e-3
+    learning_rate_final: float = 1e-4  # cosine decay ends here
+    gradient_clip: float = 1.0  # global norm
+    seed: int = 0
+    checkpoint_every: int = 200
+    validate_every: int = 200
+    preview_every: int = 200
+
+    def __post_init__(self) -> None:
+        _expect(
+            self, "positive", "iterations", "poses_per_batch", "views_per_pose", "learning_rate", "learning_rate_final", "gradient_clip"
+        )
+        _expect(self, "positive", "checkpoint_every", "validate_every", "preview_every")
+        _expect(self, "zero or more", "seed")
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What the end of a fit measures and draws."""
+
+    frames_per_split: int = 24  # evenly spaced frames of each split
+    orbit_frames: int = 60
+    orbit_width: int = 360
+    orbit_height: int = 540
+    samples_per_pixel: int = 16
+
+    def __post_init__(self) -> None:
+        _expect(self, "positive", "frames_per_split", "orbit_frames", "orbit_width", "orbit_height", "samples_per_pixel")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All sections of a fit."""
+
+    capture: CaptureSettings = field(default_factory=CaptureSettings)
+    model: ModelSettings = field(default_factory=ModelSettings)
+    rendering: RenderingSettings = field(default_factory=RenderingSettings)
+    loss: LossSettings = field(default_factory=LossSettings)
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+
+
+@dataclass(frozen=True)
+class StudioSettings:
+    """What the capture studio films."""
+
+    name: str = "default"
+    person: Literal["anny"] = "anny"
+    train_cameras: int = 10
+    held_out_cameras: int = 3
+    width: int = 176
+    height: int = 256
+    fps: float = 10.0
+    train_frames: int = 120
+    test_frames: int = 30
+    samples_per_pixel: int = 16  # camera rays; a square number stratifies best
+    light_samples: int = 3  # paths that go on from each camera ray's hit
+    max_depth: int = 3  # segments of a path, counting the camera's: 3 is one bounce of indirect light
+    texture_size: int = 512  # texels along a side of what the person is painted with
+    background: float = 0.06  # linear radiance of the constant backdrop
+    scene: str = "dome"  # a file of scenes/, without its ending, or a path to an XML file
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _expect(
+            self, "positive", "train_cameras", "width", "height", "fps", "train_frames", "samples_per_pixel", "light_samples", "max_depth"
+        )
+        _expect(self, "zero or more", "held_out_cameras", "test_frames", "seed")
+        _expect(self, "between 0 and 1", "background")
+        _expect(self, "a power of two", "texture_size")
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
+            raise ValueError(
+                f"StudioSettings(): expected name to be letters, digits, '_', '-' and '.', since it names a folder; "
+                f"got {self.name!r}. Choose another."
+            )

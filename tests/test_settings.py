@@ -1,0 +1,21 @@
+"""Settings refuse values out of range, wherever they come from; the defaults are in range."""
+
+import pytest
+
+from mitsuba_avatar.settings import LossSettings, ModelSettings, RenderingSettings, Settings, StudioSettings
+
+
+def test_values_given_in_python_are_checked_too():
+    with pytest.raises(ValueError, match=r"LossSettings\(\): expected image to be zero or more; got nan"):
+        LossSettings(image=float("nan"))
+    with pytest.raises(ValueError, match=r"expected latent_size to be positive; got 0"):
+        ModelSettings(latent_size=0)
+    with pytest.raises(ValueError, match="it names a folder; got '../x'"):
+        StudioSettings(name="../x")
+
+
+def test_sections_that_must_agree_are_held_together():
+    with pytest.raises(ValueError, match=r"model\.texture_size / model\.shadow_downscale = 128; got 64"):
+        Settings(model=ModelSettings(texture_size=512))
+    without_shadow = Settings(model=ModelSettings(texture_size=512, use_shadow=False))
+    assert without_shadow.rendering == RenderingSettings()
