@@ -1,0 +1,1 @@
+"""Captures: calibrated multi-view recordings of a person on disk, their reader, their writer, and checks."""
