@@ -1,0 +1,127 @@
+"""Linear blend skinning, its inverse, and the same for directions.
+
+Every vertex moves with the weighted mean of its joints' transforms, A_v = sum_j w_vj M_j. Metres, world axes. Weights of another rig
+are a user's mistake: their sizes carry names of their own in the types and are compared by hand, with the remedy.
+
+Source: arXiv:2105.10441, section 3.4.1 (posing) and 3.2 (unposing the registered mesh for the encoder).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SMALLEST_DETERMINANT = 1e-3  # of a blended matrix: below it a vertex is folded flat (a joint twisted by about 180 degrees)
+
+
+def blend_transforms(
+    posed_from_rest: Float[Tensor, "B J 4 4"], skinning_weights: Float[Tensor, "vertices joints"]
+) -> Float[Tensor, "B vertices 3 4"]:
+    """Upper rows of A_v = sum_j w_vj M_j for every vertex.
+
+    Gradients: flow to posed_from_rest; weights are constants.
+
+    Raises:
+        ValueError: if the joint counts differ.
+    """
+    batch, joints = posed_from_rest.shape[:2]
+    if skinning_weights.shape[1] != joints:
+        raise ValueError(
+            f"blend_transforms(): skinning_weights must be [V, {joints}] for these joints; got {list(skinning_weights.shape)}. "
+            "Take weights and skeleton from the same rig."
+        )
+    rows = posed_from_rest[:, :, :3, :].reshape(batch, joints, 12)
+    return (skinning_weights @ rows).reshape(batch, -1, 3, 4)
+
+
+def pose_vertices(
+    rest_vertices: Float[Tensor, "B V 3"], posed_from_rest: Float[Tensor, "B J 4 4"], skinning_weights: Float[Tensor, "vertices joints"]
+) -> Float[Tensor, "B V 3"]:
+    """Linear blend skinning: carry rest vertices to a pose, v' = A_v v.
+
+    Args:
+        rest_vertices: [B, V, 3] metres, world axes.
+        posed_from_rest: [B, J, 4, 4] rigid, no scale.
+        skinning_weights: [V, J] >= 0, rows sum to 1.
+
+    Returns:
+        [B, V, 3] metres, world axes.
+
+    Gradients: flow to rest_vertices and posed_from_rest; weights are constants.
+
+    Raises:
+        ValueError: if the vertex counts differ.
+
+    Source: arXiv:2105.10441, section 3.4.1.
+    """
+    _check_vertex_count("pose_vertices", rest_vertices.shape[1], skinning_weights)
+    blended = blend_transforms(posed_from_rest, skinning_weights)
+    return (blended[..., :3] * rest_vertices[:, :, None, :]).sum(-1) + blended[..., 3]
+
+
+def unpose_vertices(
+    posed_vertices: Float[Tensor, "B V 3"], posed_from_rest: Float[Tensor, "B J 4 4"], skinning_weights: Float[Tensor, "vertices joints"]
+) -> Float[Tensor, "B V 3"]:
+    """Inverse of `pose_vertices`: v = A_v^-1 v', exact wherever the blended matrix can be inverted.
+
+    Where a joint is twisted by nearly half a turn the blend folds the surface flat and has no inverse: there the determinant is
+    kept at `SMALLEST_DETERMINANT`, which bounds the result instead of letting it run to infinity.
+
+    Args:
+        posed_vertices: [B, V, 3] metres, world axes.
+        posed_from_rest: [B, J, 4, 4] rigid, no scale.
+        skinning_weights: [V, J] >= 0, rows sum to 1.
+
+    Returns:
+        [B, V, 3] metres, rest space.
+
+    Gradients: flow to posed_vertices and posed_from_rest.
+
+    Raises:
+        ValueError: if the vertex counts differ.
+
+    Source: arXiv:2105.10441, section 3.2.
+    """
+    _check_vertex_count("unpose_vertices", posed_vertices.shape[1], skinning_weights)
+    blended = blend_transforms(posed_from_rest, skinning_weights)
+    offset = posed_vertices - blended[..., 3]
+    # Cramer's rule on columns a, b, c: far faster than a batched LAPACK inverse of thousands of 3x3 matrices.
+    first, second, third = blended[..., 0], blended[..., 1], blended[..., 2]
+    across = torch.linalg.cross(second, third)
+    determinant = (first * across).sum(-1, keepdim=True)
+    safe = torch.where(determinant.abs() < SMALLEST_DETERMINANT, torch.full_like(determinant, SMALLEST_DETERMINANT), determinant)
+    rows = torch.stack([across, torch.linalg.cross(third, first), torch.linalg.cross(first, second)], dim=-2)
+    return (rows * offset[:, :, None, :]).sum(-1) / safe
+
+
+def rest_directions_from_posed(
+    directions: Float[Tensor, "B *views V 3"], posed_from_rest: Float[Tensor, "B J 4 4"], skinning_weights: Float[Tensor, "vertices joints"]
+) -> Float[Tensor, "B *views V 3"]:
+    """Turn directions at posed vertices (view vectors) back to rest space: sum_j w_vj R_j^T d, renormalised.
+
+    Args:
+        directions: [B, ..., V, 3] in the posed world; any number of views between batch and vertices.
+        posed_from_rest: [B, J, 4, 4] rigid.
+        skinning_weights: [V, J] >= 0, rows sum to 1.
+
+    Returns:
+        [B, ..., V, 3] unit vectors in rest space.
+
+    Gradients: flow to directions and posed_from_rest.
+
+    Raises:
+        ValueError: if the vertex counts differ.
+    """
+    _check_vertex_count("rest_directions_from_posed", directions.shape[-2], skinning_weights)
+    blended = blend_transforms(posed_from_rest, skinning_weights)[..., :3]  # [B, V, 3, 3]
+    batch, count = blended.shape[:2]
+    flat = directions.reshape(batch, -1, count, 3)
+    turned = (flat[..., :, None] * blended[:, None]).sum(-2).reshape(directions.shape)
+    return torch.nn.functional.normalize(turned, dim=-1)
+
+
+def _check_vertex_count(function: str, count: int, skinning_weights: Float[Tensor, "vertices joints"]) -> None:
+    if count != len(skinning_weights):
+        raise ValueError(
+            f"{function}(): vertices must be [B, {len(skinning_weights)}, 3] for this rig; got {count} vertices. "
+            "Load mesh and rig from the same capture."
+        )
