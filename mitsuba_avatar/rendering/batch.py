@@ -1,0 +1,59 @@
+"""What one launch renders: meshes, textures and views as Dr.Jit holds them. Kernels of the renderer read it, none changes it."""
+
+from dataclasses import dataclass
+
+from mitsuba_avatar.rendering.scene import MeshScene
+from mitsuba_avatar.rendering.surface_tables import SurfaceTables
+
+
+@dataclass
+class Boxes:
+    """Pixel tiles that each view must trace, as columns on the device, and the farthest depth of its mesh."""
+
+    tile_x: object
+    tile_y: object
+    tiles_per_row: object
+    start: object
+    depth_limit: object
+    num_tiles: int
+
+
+@dataclass
+class SurfaceBatch:
+    """B views of P meshes.
+
+    Attributes:
+        scene: the merged meshes in scene coordinates, for rays.
+        vertices: packets [P * V, 4], local coordinates in metres (see `views` for the frames).
+        textures: packets [B * h * w, 4], linear radiance, one texture a view.
+        views: flat table of camera rows (`views.place`).
+        centers: packets [B, 4], local camera centres and the mesh index.
+        texture_size: (h, w) texels.
+        film: (width, height) pixels.
+        seed, seed_gradient: opaque UInt32, decorrelated.
+        boxes: filled once the views' bounds are known.
+    """
+
+    scene: MeshScene
+    tables: SurfaceTables
+    vertices: object
+    textures: object
+    views: object
+    centers: object
+    num_views: int
+    texture_size: tuple[int, int]
+    film: tuple[int, int]
+    samples_per_pixel: int
+    seed: object
+    seed_gradient: object
+    boxes: Boxes | None = None
+
+    @property
+    def num_vertices(self) -> int:
+        """V of one mesh."""
+        return self.scene.num_vertices
+
+    @property
+    def num_pixels(self) -> int:
+        """Pixels of all views together."""
+        return self.num_views * self.film[0] * self.film[1]
