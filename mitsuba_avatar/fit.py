@@ -1,0 +1,98 @@
+"""Fit an avatar to a capture: `python -m mitsuba_avatar.fit [--config NAME] [--capture DIR] [section.key value ...]`.
+
+Without a capture, the embedded default one is filmed on first use. Everything lands in a run folder (training/run_folder.py).
+`torchrun --nproc_per_node N -m mitsuba_avatar.fit ...` trains data-parallel.
+"""
+
+# The rank's device must be chosen before torch and Dr.Jit are imported, and the variant before any of Mitsuba's types.
+from mitsuba_avatar.training.distributed import claim_device
+
+PROCESS = claim_device()
+
+import dataclasses  # noqa: E402
+import sys  # noqa: E402
+import time  # noqa: E402
+from dataclasses import dataclass  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+from mitsuba_avatar.command_line import parse_command  # noqa: E402
+from mitsuba_avatar.rendering import backend  # noqa: E402
+from mitsuba_avatar.presets import resolve  # noqa: E402
+from mitsuba_avatar.settings import Settings  # noqa: E402
+
+
+@dataclass(frozen=True)
+class FitCommand:
+    """Fit an avatar to a capture by differentiable rendering."""
+
+    config: str = "default"  # preset of configs/, or a YAML file
+    capture: str = ""  # capture folder; default: the setting capture.path, else the embedded capture
+    run: str = ""  # run folder; default: runs/<config>, numbered if taken
+    resume: bool = False  # continue the run
+    variant: str = ""  # Mitsuba variant; default: the setting rendering.variant
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns the exit status."""
+    try:
+        command, overrides = parse_command(FitCommand, Settings, arguments)
+        settings = _resolved(command, overrides)
+        settings = _with_variant(settings, backend.select_variant(settings.rendering.variant))
+        return _fit(command, settings)
+    except (ValueError, OSError, backend.BackendError) as error:
+        sys.stderr.write(f"fit: {error}\n")
+        return 2
+
+
+def _resolved(command: FitCommand, overrides: list[str]) -> Settings:
+    preset: str | Path = command.config
+    if command.resume:
+        preset = _run_path(command) / "settings.yaml"
+    if command.capture:
+        overrides = [*overrides, f"capture.path={command.capture}"]
+    if command.variant:
+        overrides = [*overrides, f"rendering.variant={command.variant}"]
+    return resolve(preset, overrides)
+
+
+def _with_variant(settings: Settings, variant: str) -> Settings:
+    """Settings that say which variant ran, not "auto"."""
+    return dataclasses.replace(settings, rendering=dataclasses.replace(settings.rendering, variant=variant))
+
+
+def _run_path(command: FitCommand) -> Path:
+    """The run folder that the command speaks of."""
+    base = Path(command.run) if command.run else Path("runs") / Path(command.config).stem
+    if command.run or command.resume:
+        return base
+    path, number = base, 2
+    while path.exists():
+        path, number = base.with_name(f"{base.name}-{number}"), number + 1
+    return path
+
+
+def _fit(command: FitCommand, settings: Settings) -> int:
+    # Imported here, after the variant is set, because these modules load torch and Dr.Jit.
+    from mitsuba_avatar.fitting import Fit
+
+    started = time.perf_counter()
+    fit = Fit.prepare(settings, _run_path(command), PROCESS, is_resumed=command.resume)
+    try:
+        is_finished = fit.train()
+    finally:
+        fit.leave()
+    if not is_finished:
+        sys.stderr.write(f"Interrupted; everything up to here is saved. Continue with: {_resume_line(fit.run.path)}\n")
+        return 130
+    if PROCESS.is_main:
+        fit.present()
+        sys.stderr.write(f"Done in {time.perf_counter() - started:.0f} s. Look at {fit.run.path}\n")
+    return 0
+
+
+def _resume_line(path: Path) -> str:
+    return f"python -m mitsuba_avatar.fit --run {path} --resume"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,254 @@
+"""One fit from capture to report: opens or films the capture, prepares the avatar, trains it, evaluates it, draws it.
+
+The stages do the work; this module is the order in which they are called.
+"""
+
+import dataclasses
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from mitsuba_avatar.body.rig import Rig, load_rig
+from mitsuba_avatar.captures.checks import check_values
+from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.filming.film import default_capture_path, film_capture
+from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.progress import progress_bar
+from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion, FrameOcclusion
+from mitsuba_avatar.rendering.surface import SurfaceRenderer
+from mitsuba_avatar.reporting.camera_paths import orbit
+from mitsuba_avatar.reporting.evaluation import Evaluator
+from mitsuba_avatar.reporting.figures import loss_curves, save_image
+from mitsuba_avatar.reporting.metrics import read_records
+from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, on_backdrop
+from mitsuba_avatar.reporting.tables import terminal_table
+from mitsuba_avatar.reporting.video import write_video
+from mitsuba_avatar.presets import resolve
+from mitsuba_avatar.settings import Settings, StudioSettings
+from mitsuba_avatar.training.batches import FrameReader
+from mitsuba_avatar.training.distributed import Process, join_processes, leave_processes
+from mitsuba_avatar.training.loop import MetricsLog, Trainer
+from mitsuba_avatar.training.run_folder import RunFolder
+from mitsuba_avatar.training.statistics import evenly_spaced, training_statistics
+
+LOG_EVERY = 10  # iterations between lines of metrics.jsonl
+VALIDATION_FRAMES = 4
+
+
+def open_capture(settings: Settings, process: Process = Process()) -> Capture:  # noqa: B008 - frozen
+    """The capture that the settings name, or the embedded one, filmed on first use; checked before any long work.
+
+    Raises:
+        FileNotFoundError, ValueError: the capture is missing, unfinished or unusable; the message names file and remedy.
+    """
+    if settings.capture.path:
+        capture = Capture.open(settings.capture.path, settings.capture.image_scale)
+    else:
+        studio = resolve("studio/default", kind=StudioSettings)
+        folder = default_capture_path(studio)
+        if process.is_main and not (folder / "capture.yaml").exists():
+            sys.stderr.write("No capture given: filming the embedded one (once; later fits reuse it).\n")
+            with progress_bar("filming", 1) as bar:
+                film_capture(studio, folder, bar.update)
+        while not (folder / "capture.yaml").exists():  # other ranks wait for the one that films
+            time.sleep(1.0)
+        capture = Capture.open(folder, settings.capture.image_scale)
+    if settings.capture.held_out_cameras:
+        capture.description = dataclasses.replace(capture.description, held_out_cameras=settings.capture.held_out_cameras)
+    check_values(capture, load_rig(capture.rig_path))
+    return capture
+
+
+class Fit:
+    """A fit in progress. Make it with `prepare`, then `train`, then `present`; `leave` releases the other ranks."""
+
+    def __init__(self, settings: Settings, run: RunFolder, trainer: Trainer, occlusion: FrameOcclusion, process: Process):
+        self.settings, self.run, self.trainer, self.process = settings, run, trainer, process
+        self.reader, self.avatar = trainer.reader, trainer.avatar
+        self.occlusion = occlusion
+        self.capture = self.reader.capture
+
+    @staticmethod
+    def prepare(settings: Settings, path: Path, process: Process, is_resumed: bool) -> "Fit":
+        """Everything before the first step.
+
+        Raises:
+            FileNotFoundError, FileExistsError, ValueError: capture, run folder or checkpoint are not usable.
+        """
+        capture = open_capture(settings, process)
+        rig = load_rig(capture.rig_path)
+        is_on_gpu = settings.rendering.variant.startswith("cuda")
+        join_processes(process, is_on_gpu)
+        if is_resumed:
+            run = RunFolder.open(path)
+            avatar = run.load_avatar("last").train()
+        else:
+            with progress_bar("mean texture", 1, is_shown=process.is_main) as bar:
+                statistics = training_statistics(capture, rig, settings.model.texture_size, bar.update)
+            torch.manual_seed(settings.training.seed)
+            avatar = Avatar(rig, settings.model, statistics)
+            face_size = capture.face.shape[1]
+            if process.is_main:
+                run = RunFolder.create(path, settings, rig, capture.path, face_size)
+            else:
+                run = RunFolder(path, settings, rig, capture.path, face_size)
+        avatar = avatar.to("cuda" if is_on_gpu else "cpu")
+        occlusion = frame_occlusion(settings, rig, avatar, capture)
+        with progress_bar("ambient occlusion", len(capture.frames), is_shown=process.is_main) as bar:
+            occlusion.bake(bar.update)
+        reader = FrameReader(capture, occlusion)
+        trainer = Trainer(avatar, rig, reader, settings, process)
+        if is_resumed:
+            trainer.resume(run.checkpoints)
+        return Fit(settings, run, trainer, occlusion, process)
+
+    def train(self) -> bool:
+        """Train to the end; False if the user stopped it, with everything saved."""
+        training = self.settings.training
+        trainer, is_main = self.trainer, self.process.is_main
+        log = MetricsLog(self.run.log_path, trainer.iteration) if is_main else None
+        evaluator, presentation = self._tools(samples_per_pixel=4)
+        shots = self._preview_shots()
+
+        with progress_bar("fitting", training.iterations, trainer.iteration, is_main) as bar, interrupts() as is_interrupted:
+
+            def after_step(iteration: int, terms: dict[str, float]) -> None:
+                if not is_main:
+                    return
+                bar.update(iteration, **terms)
+                is_last = iteration == training.iterations or is_interrupted()
+                psnr = None
+                if iteration % training.validate_every == 0 or is_last:
+                    psnr = self._validate(evaluator)
+                if iteration % LOG_EVERY == 0 or psnr is not None:
+                    record = {"iteration": iteration, **terms, "learning_rate": trainer.learning_rate(iteration - 1)}
+                    milliseconds = {f"{name}_ms": value for name, value in trainer.timer.means().items()}
+                    log.write(record | milliseconds | ({} if psnr is None else {"validation_psnr": psnr}))
+                if iteration % training.preview_every == 0 or is_last:
+                    save_image(self.run.previews / f"{iteration:06d}.png", presentation.preview(shots))
+                if iteration % training.checkpoint_every == 0 or is_last:
+                    trainer.save(self.run.checkpoints, psnr)
+                if is_interrupted():
+                    raise KeyboardInterrupt
+
+            try:
+                trainer.run(after_step)
+            except KeyboardInterrupt:
+                return False
+        return True
+
+    def present(self) -> None:
+        """Evaluate the best checkpoint and draw it: metrics, pictures, orbit."""
+        evaluation = self.settings.evaluation
+        self.avatar.load_state_dict(self.run.checkpoints.load_avatar("best"))
+        evaluator, presentation = self._tools(evaluation.samples_per_pixel)
+        frames = evaluator.split_frames(evaluation.frames_per_split)
+        with progress_bar("evaluating", sum(map(len, frames.values()))) as bar:
+            metrics = evaluator.measure(frames, progress=bar.update)
+        metrics.save(self.run.metrics_path)
+        shots = held_out_shots(self.capture, frames.get("test") or frames["train"])
+        save_image(self.run.pictures / "comparison.png", presentation.compare(shots))
+        presentation.save_held_out_pictures(self.run.pictures / "held_out", shots)
+        records = read_records(self.run.log_path)
+        loss_curves(
+            self.run.pictures / "curves.png",
+            records,
+            {"loss": ["loss"], "terms": ["image", "mask", "geometry", "laplacian", "kl"], "PSNR": ["validation_psnr"]},
+        )
+        self._draw_orbit(frames.get("test") or frames["train"])
+        sys.stderr.write(terminal_table(metrics.means()) + "\n")
+
+    def leave(self) -> None:
+        """Disconnect from the other ranks, if any."""
+        leave_processes(self.process)
+
+    def _tools(self, samples_per_pixel: int) -> tuple[Evaluator, Presentation]:
+        renderer = SurfaceRenderer(self.run.rig.topology, self.reader.width, self.reader.height, samples_per_pixel)
+        evaluator = Evaluator(self.avatar, self.reader, renderer)
+        return evaluator, Presentation(evaluator, self.run.rig)
+
+    def _validate(self, evaluator: Evaluator) -> float:
+        """PSNR in dB of a few training frames seen by held-out cameras (by training cameras where there are no others)."""
+        self.avatar.eval()
+        names = self.capture.camera_names(held_out=True) or self.capture.camera_names()
+        frames = {"train": evenly_spaced(self.capture.frame_indices("train"), VALIDATION_FRAMES)}
+        means = evaluator.measure(frames, ["avatar"], names).means()["avatar"]["train"]
+        self.avatar.train()
+        return next(iter(means.values()))["psnr"]
+
+    def _preview_shots(self) -> list[Shot]:
+        """A training view, and the held-out cameras' views of two test frames."""
+        capture = self.capture
+        splits = {frame.split for frame in capture.frames}
+        seen, held_out = capture.camera_names(held_out=False), capture.camera_names(held_out=True)
+        train = capture.frame_indices("train")
+        shots = [Shot(train[len(train) // 2], seen[0])]
+        test = capture.frame_indices("test") if "test" in splits else train
+        return shots + [Shot(test[(i + 1) * len(test) // 3], name) for i, name in enumerate((held_out or seen)[:2])]
+
+    def _draw_orbit(self, frames: list[int]) -> None:
+        """The avatar driven by the test split, a camera walking around it."""
+        evaluation, capture = self.settings.evaluation, self.capture
+        split = capture.frame_indices(capture.frames[frames[0]].split)
+        along = [split[i * len(split) // evaluation.orbit_frames] for i in range(evaluation.orbit_frames)]
+        with torch.no_grad():
+            points = [self._posed_template(i) for i in evenly_spaced(split, 8)]
+        cameras = orbit(torch.cat(points).numpy()[::37], evaluation.orbit_frames, evaluation.orbit_width, evaluation.orbit_height)
+        renderer = SurfaceRenderer(
+            self.run.rig.topology, evaluation.orbit_width, evaluation.orbit_height, samples_per_pixel=evaluation.samples_per_pixel
+        )
+        with progress_bar("orbit", evaluation.orbit_frames) as bar:
+            drawn = draw_along(self.avatar, capture, along, cameras, renderer, self.occlusion.occlusion)
+
+            def pictures() -> Iterator:
+                for done, (radiance, mask) in enumerate(drawn):
+                    bar.update(done + 1)
+                    yield on_backdrop(radiance, mask)
+
+            write_video(self.run.path / "orbit.mp4", pictures(), fps=12)
+
+    def _posed_template(self, index: int) -> torch.Tensor:
+        capture = self.capture
+        theta, root = (torch.from_numpy(values[index : index + 1].copy()) for values in (capture.theta, capture.root))
+        return self.avatar.pose_template(theta, root)[0]
+
+
+def frame_occlusion(settings: Settings, rig: Rig, avatar: Avatar, capture: Capture) -> FrameOcclusion:
+    """The ambient occlusion of every frame of a capture, at the size that the avatar's shadow branch reads."""
+    baker = AmbientOcclusion(
+        rig.topology,
+        settings.model.shadow_size,
+        settings.rendering.ambient_occlusion_rays,
+        settings.rendering.ambient_occlusion_distance,
+    )
+    return FrameOcclusion(baker, rig, avatar.template_vertices, capture.theta)
+
+
+def held_out_shots(capture: Capture, frames: list[int], count: int = 4) -> list[Shot]:
+    """A few frames spread over a list, each seen by the next of the held-out cameras (of all cameras where none is held out)."""
+    names = capture.camera_names(held_out=True) or capture.camera_names()
+    return [Shot(frame, names[i % len(names)]) for i, frame in enumerate(evenly_spaced(frames, count))]
+
+
+@contextmanager
+def interrupts() -> Iterator:
+    """Turn the first Ctrl-C (or SIGTERM) into a question that the loop asks between steps; a second one stops at once."""
+    asked = threading.Event()
+
+    def handle(number: int, frame: object) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked.is_set
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,0 +1,71 @@
+"""A finished run opened for use: avatar, capture, renderer. What the commands that come after `fit` start from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mitsuba_avatar.body.rig import load_rig
+from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion, FrameOcclusion
+from mitsuba_avatar.rendering.surface import SurfaceRenderer
+from mitsuba_avatar.reporting.evaluation import Evaluator
+from mitsuba_avatar.training.batches import FrameReader
+from mitsuba_avatar.training.run_folder import RunFolder
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """An avatar with the capture that drives it."""
+
+    run: RunFolder
+    avatar: Avatar
+    capture: Capture
+
+    @staticmethod
+    def open(path: Path | str, capture_path: str = "", checkpoint: str = "best") -> "LoadedRun":
+        """Open a run.
+
+        Args:
+            path: run folder.
+            capture_path: capture that drives and judges it; empty for the one it was trained on.
+            checkpoint: "best" or "last".
+
+        Raises:
+            FileNotFoundError: run, checkpoint or capture are not there.
+            ValueError: the capture has another rig, or a file is damaged.
+        """
+        if checkpoint not in ("best", "last"):
+            raise ValueError(f"LoadedRun.open(): expected checkpoint 'best' or 'last'; got {checkpoint!r}.")
+        run = RunFolder.open(path)
+        capture = Capture.open(capture_path or run.capture_path, run.settings.capture.image_scale)
+        if load_rig(capture.rig_path).fingerprint != run.rig.fingerprint:
+            raise ValueError(
+                f"LoadedRun.open(): capture {capture.path} has another rig than run {run.path}. "
+                "Drive the avatar with a capture of the rig it was trained on."
+            )
+        return LoadedRun(run, run.load_avatar(checkpoint), capture)
+
+    def occlusion(self) -> AmbientOcclusion:
+        """Baker of occlusion maps at the size that the avatar reads."""
+        return avatar_occlusion(self.run)
+
+    def evaluator(self) -> Evaluator:
+        """Draws and measures the capture's views."""
+        frame_occlusion = FrameOcclusion(self.occlusion(), self.run.rig, self.avatar.template_vertices, self.capture.theta)
+        reader = FrameReader(self.capture, frame_occlusion)
+        return Evaluator(self.avatar, reader, self.renderer(reader.width, reader.height))
+
+    def renderer(self, width: int, height: int) -> SurfaceRenderer:
+        """Renderer of a film size, with the run's number of samples for final pictures."""
+        return SurfaceRenderer(self.run.rig.topology, width, height, samples_per_pixel=self.run.settings.evaluation.samples_per_pixel)
+
+
+def avatar_occlusion(run: RunFolder) -> AmbientOcclusion:
+    """Baker of occlusion maps for a run's avatar."""
+    settings = run.settings
+    return AmbientOcclusion(
+        run.rig.topology,
+        settings.model.shadow_size,
+        settings.rendering.ambient_occlusion_rays,
+        settings.rendering.ambient_occlusion_distance,
+    )

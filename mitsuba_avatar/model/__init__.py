@@ -1,0 +1,1 @@
+"""The avatar's networks: encoder, localized conditioning, decoder, shadow branch, and the whole."""

@@ -1,0 +1,63 @@
+"""Spatially localized driving signals: e = proj(M o tile2d(signal)), for the joint angles theta and for the face signal f.
+
+A driving signal is standardised, repeated over the map, masked to the region of the surface it governs and compressed at every
+location by two 1x1 convolutions with untied biases. Because what follows is convolutional too, a joint angle cannot reach a texel
+farther from its region than the decoder's receptive field: chance correlations between distant parts cannot be learnt.
+
+Symbols: D entries of the signal, S texels along the conditioning map, C channels of the embedding.
+
+Source: arXiv:2105.10441, section 3.3.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last, convolution
+
+# An entry that hardly moves in training has a tiny deviation, and dividing by it would blow up tracking noise, or the first real
+# movement, to hundreds of deviations. So no deviation counts as less than this fraction of the signal's largest.
+SMALLEST_RELATIVE_STD = 0.05
+
+
+class Standardization(nn.Module):
+    """Shift and scale a signal by the statistics of the training set: (signal - mean) / std.
+
+    Args:
+        mean, std: [D] in the signal's own unit; `std` is kept above `SMALLEST_RELATIVE_STD` of its largest entry.
+    """
+
+    def __init__(self, mean: Float[Tensor, "D"], std: Float[Tensor, "D"]):  # noqa: F821 - jaxtyping dimension
+        super().__init__()
+        self.register_buffer("mean", mean.clone())
+        self.register_buffer("std", std.clone())
+
+    def forward(self, signal: Float[Tensor, "B D"]) -> Float[Tensor, "B D"]:
+        """Standardised signal, without unit; a signal that never moves (all deviations zero) is only shifted."""
+        largest = self.std.max()
+        floor = torch.where(largest > 0, SMALLEST_RELATIVE_STD * largest, torch.ones_like(largest))
+        return (signal - self.mean) / self.std.maximum(floor)
+
+
+class LocalizedSignal(nn.Module):
+    """Maps of one driving signal: mask, then compress at every location.
+
+    Args:
+        masks: [D, S, S] in {0, 1}, where each entry may act; all ones for a signal that reaches everywhere.
+        channels: C of the embedding, or None to hand on the masked signal as it is (then C = D).
+    """
+
+    def __init__(self, masks: Float[Tensor, "D S S"], channels: int | None):
+        super().__init__()
+        # Rebuilt from the rig, hence no part of a checkpoint.
+        self.register_buffer("masks", masks.clone(), persistent=False)
+        entries, size = masks.shape[:2]
+        self.channels = entries if channels is None else channels
+        self.projection = nn.Identity()
+        if channels is not None:
+            first, second = convolution(entries, channels, size, kernel=1), convolution(channels, channels, size, kernel=1)
+            self.projection = nn.Sequential(first, nn.LeakyReLU(NEGATIVE_SLOPE), second)
+
+    def forward(self, signal: Float[Tensor, "B D"]) -> Float[Tensor, "B C S S"]:
+        """Embedding e of a standardised signal. Outside its masks an entry has no influence whatever."""
+        return self.projection(channels_last(self.masks * signal[:, :, None, None]))

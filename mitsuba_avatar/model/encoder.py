@@ -1,0 +1,62 @@
+"""The encoder: from the registered mesh of a frame to a Gaussian over the latent code z. Used in training only.
+
+It sees what the driving signal cannot tell: the registered vertices, unposed, minus the template, drawn as a map over the texture
+atlas. Convention of the whole project: `logvar` is the logarithm of the variance, so std = exp(0.5 * logvar).
+
+Source: arXiv:2105.10441, section 3.2.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last
+from mitsuba_avatar.settings import ModelSettings
+
+# In units of `displacement_scale`. Unposing sends the vertices of a folded joint far away (see body.skinning.unpose_vertices), and one
+# such texel would drown all others; real clothing stays within this.
+LARGEST_OFFSET = 10.0
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Diagonal Gaussian over the latent code, one row a pose.
+
+    Attributes:
+        mu: [P, Z] mean.
+        logvar: [P, Z] logarithm of the variance.
+    """
+
+    mu: Float[Tensor, "P Z"]
+    logvar: Float[Tensor, "P Z"]
+
+    def sample(self, noise: Float[Tensor, "P Z"]) -> Float[Tensor, "P Z"]:
+        """Reparameterised draw z = mu + std * noise; noise is drawn by the caller, who owns the seeds. Gradients: to mu and logvar."""
+        return self.mu + torch.exp(0.5 * self.logvar) * noise
+
+
+class Encoder(nn.Module):
+    """Strided convolutions over the map of offsets, halving it once per entry of `encoder_channels`, then one linear layer."""
+
+    def __init__(self, settings: ModelSettings):
+        super().__init__()
+        layers: list[nn.Module] = []
+        previous = 3
+        for channels in settings.encoder_channels:
+            layers += [nn.Conv2d(previous, channels, kernel_size=4, stride=2, padding=1), nn.LeakyReLU(NEGATIVE_SLOPE)]
+            previous = channels
+        self.convolutions = nn.Sequential(*layers)
+        smallest = settings.encoder_size >> len(settings.encoder_channels)
+        self.head = nn.Linear(previous * smallest**2, 2 * settings.latent_size)
+
+    def forward(self, offsets: Float[Tensor, "P 3 S S"]) -> Posterior:
+        """Posterior of each pose.
+
+        Args:
+            offsets: [P, 3, S, S] unposed registered surface minus template, in units of `displacement_scale`, S = encoder_size.
+        """
+        features = self.convolutions(channels_last(offsets.clamp(-LARGEST_OFFSET, LARGEST_OFFSET)))
+        mu, logvar = self.head(features.flatten(1)).chunk(2, dim=1)  # [P, Z] each
+        return Posterior(mu, logvar)

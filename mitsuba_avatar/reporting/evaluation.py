@@ -1,0 +1,127 @@
+"""Driving an avatar over a capture and measuring it against the images, beside two baselines that nobody should lose to.
+
+All are *driven* (paper, section 4): theta, face and root of the frame are given, the latent code is zero. The baselines are the posed
+template with the mean texture, which knows skinning and nothing else, and the captured image of the training frame nearest in pose,
+seen by the same camera, which knows appearance and nothing else. Pictures are composited on the capture's background and measured as
+display-encoded values inside the captured mask.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mitsuba_avatar.captures.colour import encode
+from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.rendering.surface import SurfaceRenderer
+from mitsuba_avatar.reporting.metrics import MetricsAccumulator, image_metrics, silhouette_iou, vertex_error_mm
+from mitsuba_avatar.training.batches import FrameBatch, FrameReader
+from mitsuba_avatar.training.statistics import evenly_spaced
+
+METHODS = ("avatar", "template_mean_texture", "nearest_frame")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What one method makes of one frame, seen by B cameras.
+
+    Attributes:
+        images: [B, 3, H, W] display-encoded, composited.
+        masks: [B, 1, H, W].
+        vertices: [V, 3] metres; None where the method has no mesh.
+    """
+
+    images: Float[Tensor, "B 3 H W"]
+    masks: Float[Tensor, "B 1 H W"]
+    vertices: Float[Tensor, "V 3"] | None
+
+
+class Evaluator:
+    """Draws and measures frames of a capture with a given avatar.
+
+    Args:
+        avatar: to be driven.
+        reader: of the capture.
+        renderer: of the capture's film size; its samples per pixel set the antialiasing of the pictures.
+    """
+
+    def __init__(self, avatar: Avatar, reader: FrameReader, renderer: SurfaceRenderer):
+        self.avatar, self.reader, self.renderer = avatar, reader, renderer
+        self.capture: Capture = reader.capture
+        self.train_frames = self.capture.frame_indices("train")
+
+    @torch.no_grad()
+    def draw(self, method: str, batch: FrameBatch) -> Drawn:
+        """Draw a batch of one pose with a method of METHODS."""
+        if method == "nearest_frame":
+            return self._draw_nearest(batch)
+        avatar = self.avatar
+        if method == "avatar":
+            output = avatar.decode(batch.theta, batch.root, batch.face, None, batch.camera_centers, batch.ambient_occlusion)
+            vertices, textures = output.vertices, output.textures[0]
+        else:
+            vertices = avatar.pose_template(batch.theta, batch.root)
+            textures = avatar.mean_texture.expand(len(batch.cameras), -1, -1, -1)
+        radiance, masks = self.renderer.render(vertices, textures, batch.cameras, seed=batch.frames[0])
+        images = encode(radiance + (1 - masks) * batch.backgrounds, "srgb")
+        return Drawn(images.clamp(0, 1), masks, vertices[0])
+
+    def measure(
+        self,
+        frames: dict[str, list[int]],
+        methods: Sequence[str] = METHODS,
+        camera_names: Sequence[str] | None = None,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> MetricsAccumulator:
+        """Errors of every method over chosen frames of each split, all cameras or chosen ones.
+
+        Args:
+            frames: split -> frame indices.
+            methods: of METHODS.
+            camera_names: None for all.
+            progress: called as progress(done, total), in frames.
+        """
+        result = MetricsAccumulator()
+        names = list(camera_names or self.capture.camera_names())
+        held_out = set(self.capture.camera_names(held_out=True))
+        total, done = sum(map(len, frames.values())), 0
+        for split, indices in frames.items():
+            for index in indices:
+                batch = self.reader.read([index], [names])
+                references, masks = as_images(encode(batch.images, "srgb").clamp(0, 1)), batch.masks[:, 0].numpy()
+                for method in methods:
+                    drawn = self.draw(method, batch)
+                    images = as_images(drawn.images)
+                    for view, name in enumerate(names):
+                        if not masks[view].any():
+                            continue  # the person is outside this camera's image
+                        values = image_metrics(images[view], references[view], masks[view])
+                        values["iou"] = silhouette_iou(drawn.masks[view, 0].numpy(), masks[view])
+                        if drawn.vertices is not None and batch.vertices is not None:
+                            values["vertex_mm"] = vertex_error_mm(drawn.vertices.numpy(), batch.vertices[0].numpy())
+                        result.add(method, split, "held_out" if name in held_out else "seen", values)
+                done += 1
+                progress(done, total)
+        return result
+
+    def split_frames(self, per_split: int) -> dict[str, list[int]]:
+        """At most `per_split` evenly spaced frames of each split that the capture has."""
+        splits = {frame.split for frame in self.capture.frames}
+        return {split: evenly_spaced(self.capture.frame_indices(split), per_split) for split in ("train", "test") if split in splits}
+
+    def _draw_nearest(self, batch: FrameBatch) -> Drawn:
+        """The captured images of the training frame nearest in pose angles; for a training frame, the nearest other one."""
+        candidates = [i for i in self.train_frames if i != batch.frames[0]]
+        distance = np.linalg.norm(self.capture.theta[candidates] - batch.theta.numpy(), axis=1)
+        nearest = self.reader.read([candidates[int(distance.argmin())]], batch.camera_names)
+        vertices = None if nearest.vertices is None else nearest.vertices[0]
+        return Drawn(encode(nearest.images, "srgb").clamp(0, 1), nearest.masks, vertices)
+
+
+def as_images(images: Float[Tensor, "B 3 H W"]) -> Float[np.ndarray, "B H W 3"]:
+    """Torch's channel order to numpy's."""
+    return images.permute(0, 2, 3, 1).contiguous().numpy()

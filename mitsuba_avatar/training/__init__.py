@@ -1,0 +1,1 @@
+"""Learning an avatar from a capture: losses, the loop, checkpoints."""

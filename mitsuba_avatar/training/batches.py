@@ -1,0 +1,170 @@
+"""Training batches: a few poses, several views of each, decoded ahead of time and the same for every run with the same seed.
+
+What iteration i sees depends on the seed and i alone, so that a resumed run continues the same curve, and ranks of a distributed run
+take disjoint slices of one global batch. Symbols: P poses, N views a pose, B = P * N images.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
+from mitsuba_avatar.rendering.cameras import CameraBatch
+
+AHEAD = 2  # batches decoded in advance: enough to hide the disk, little memory
+
+
+@dataclass(frozen=True)
+class FrameBatch:
+    """P poses, N views each; images are pose-major.
+
+    Attributes:
+        frames: P frame indices.
+        camera_names: P lists of N names.
+        theta: [P, D] radians. root: [P, 4, 4]. face: [P, F].
+        vertices: [P, V, 3] registered mesh, metres; None where the capture has none.
+        ambient_occlusion: [P, 1, S, S].
+        images: [B, 3, H, W] linear radiance. masks: [B, 1, H, W]. backgrounds: [B, 3, H, W] linear radiance.
+        cameras: B cameras.
+    """
+
+    frames: list[int]
+    camera_names: list[list[str]]
+    theta: Float[Tensor, "P D"]
+    root: Float[Tensor, "P 4 4"]
+    face: Float[Tensor, "P F"]
+    vertices: Float[Tensor, "P V 3"] | None
+    ambient_occlusion: Float[Tensor, "P 1 S S"]
+    images: Float[Tensor, "B 3 H W"]
+    masks: Float[Tensor, "B 1 H W"]
+    backgrounds: Float[Tensor, "B 3 H W"]
+    cameras: CameraBatch
+
+    @property
+    def camera_centers(self) -> Float[Tensor, "P N 3"]:
+        """[P, N, 3] metres, world axes."""
+        return self.cameras.centers.view(len(self.frames), -1, 3)
+
+
+class FrameReader:
+    """Reads chosen frames and views of a capture as a batch.
+
+    Raises:
+        ValueError: the cameras' images have different sizes, or a driving signal is missing.
+    """
+
+    def __init__(self, capture: Capture, occlusion: FrameOcclusion):
+        self.capture, self.occlusion = capture, occlusion
+        sizes = {(camera.width, camera.height) for camera in capture.cameras.values()}
+        if len(sizes) != 1:
+            raise ValueError(
+                f"FrameReader(): expected one image size for all cameras of {capture.path}; got {sorted(sizes)}. "
+                "Crop or resize the images (and cameras.json) to one size."
+            )
+        ((self.width, self.height),) = sizes
+        missing = [name for name in ("theta", "root", "face") if getattr(capture, name) is None]
+        if missing:
+            raise ValueError(f"FrameReader(): {capture.path} has no {', '.join(missing)}. Add the missing .npy files; see docs/capture.md.")
+
+    def read(self, frames: list[int], camera_names: list[list[str]]) -> FrameBatch:
+        """Decode the images of P frames, N cameras each; raises what `Capture.image` raises, naming the file."""
+        capture = self.capture
+        images, masks, backgrounds, cameras = [], [], [], []
+        for frame, names in zip(frames, camera_names, strict=True):
+            for name in names:
+                mask = capture.mask(name, frame)
+                background = capture.background(name)
+                images.append(composited(capture.image(name, frame), mask, background))
+                masks.append(mask)
+                backgrounds.append(np.zeros((self.height, self.width, 3), np.float32) if background is None else background)
+                cameras.append(capture.cameras[name])
+        return FrameBatch(
+            frames=frames,
+            camera_names=camera_names,
+            theta=_rows(capture.theta, frames),
+            root=_rows(capture.root, frames),
+            face=_rows(capture.face, frames),
+            vertices=None if capture.vertices is None else _rows(capture.vertices, frames),
+            ambient_occlusion=self.occlusion.maps(frames),
+            images=_channels_first(images),
+            masks=torch.from_numpy(np.stack(masks))[:, None],
+            backgrounds=_channels_first(backgrounds),
+            cameras=CameraBatch.from_cameras(cameras),
+        )
+
+
+class BatchSampler:
+    """Which frames and cameras each iteration sees.
+
+    Frames come in a fresh random order each pass over the capture; cameras of a frame are drawn without repetition.
+
+    Args:
+        frames: indices to draw from.
+        camera_names: cameras to draw from.
+        poses, views: P of the *global* batch, N.
+        seed: base seed.
+        rank, num_ranks: this process's slice of the poses.
+    """
+
+    def __init__(
+        self, frames: list[int], camera_names: list[str], poses: int, views: int, seed: int, rank: int = 0, num_ranks: int = 1
+    ):
+        if poses % num_ranks:
+            raise ValueError(
+                f"BatchSampler(): {poses} poses a batch cannot be shared by {num_ranks} processes. "
+                "Make training.poses_per_batch a multiple of the number of processes."
+            )
+        if views > len(camera_names):
+            raise ValueError(
+                f"BatchSampler(): training.views_per_pose is {views}, but the capture has {len(camera_names)} training cameras. Lower it."
+            )
+        self.frames, self.camera_names = frames, camera_names
+        self.poses, self.views, self.seed = poses, views, seed
+        self.rank, self.num_ranks = rank, num_ranks
+
+    def draw(self, iteration: int) -> tuple[list[int], list[list[str]]]:
+        """Frames and camera names of an iteration, this rank's share."""
+        cameras = np.random.default_rng([self.seed, 1, iteration])
+        frames, names = [], []
+        for slot in range(iteration * self.poses, (iteration + 1) * self.poses):
+            order = np.random.default_rng([self.seed, 0, slot // len(self.frames)]).permutation(len(self.frames))
+            frames.append(self.frames[order[slot % len(self.frames)]])
+            names.append([self.camera_names[i] for i in cameras.permutation(len(self.camera_names))[: self.views]])
+        share = self.poses // self.num_ranks
+        own = slice(self.rank * share, (self.rank + 1) * share)
+        return frames[own], names[own]
+
+
+def batches(reader: FrameReader, sampler: BatchSampler, start: int, stop: int) -> Iterator[FrameBatch]:
+    """Batches of iterations start..stop-1, in order; a thread decodes the next ones meanwhile (image decoding releases Python's lock)."""
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="batches") as pool:
+        waiting: list[Future[FrameBatch]] = []
+        try:
+            for iteration in range(start, stop):
+                while len(waiting) < AHEAD and iteration + len(waiting) < stop:
+                    waiting.append(pool.submit(reader.read, *sampler.draw(iteration + len(waiting))))
+                yield waiting.pop(0).result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def composited(
+    image: Float[np.ndarray, "H W 3"], mask: Float[np.ndarray, "H W"], background: Float[np.ndarray, "H W 3"] | None
+) -> Float[np.ndarray, "H W 3"]:
+    """The image to compare renders with: as captured where the background is known, on black otherwise."""
+    return image if background is not None else image * mask[..., None]
+
+
+def _rows(values: Float[np.ndarray, "N *shape"], frames: list[int]) -> Float[Tensor, "P *shape"]:
+    return torch.from_numpy(np.stack([values[i] for i in frames]).astype(np.float32))
+
+
+def _channels_first(images: list[Float[np.ndarray, "H W 3"]]) -> Float[Tensor, "B 3 H W"]:
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
