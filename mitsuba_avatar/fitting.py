@@ -3,13 +3,12 @@
 The stages do the work; this module is the order in which they are called.
 """
 
-import dataclasses
+import math
 import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import torch
@@ -19,6 +18,7 @@ from mitsuba_avatar.captures.checks import check_values
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.filming.film import default_capture_path, film_capture
 from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.progress import progress_bar
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion, FrameOcclusion
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
@@ -26,14 +26,14 @@ from mitsuba_avatar.reporting.camera_paths import orbit
 from mitsuba_avatar.reporting.evaluation import Evaluator
 from mitsuba_avatar.reporting.figures import loss_curves, save_image
 from mitsuba_avatar.reporting.metrics import read_records
-from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, on_backdrop
+from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, on_backdrop, posed_templates
 from mitsuba_avatar.reporting.tables import terminal_table
 from mitsuba_avatar.reporting.video import write_video
-from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.settings import Settings, StudioSettings
 from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.distributed import Process, join_processes, leave_processes
 from mitsuba_avatar.training.loop import MetricsLog, Trainer
+from mitsuba_avatar.training.readiness import check_trainable, open_as_set
 from mitsuba_avatar.training.run_folder import RunFolder
 from mitsuba_avatar.training.statistics import evenly_spaced, training_statistics
 
@@ -48,7 +48,7 @@ def open_capture(settings: Settings, process: Process = Process()) -> Capture:  
         FileNotFoundError, ValueError: the capture is missing, unfinished or unusable; the message names file and remedy.
     """
     if settings.capture.path:
-        capture = Capture.open(settings.capture.path, settings.capture.image_scale)
+        capture = open_as_set(settings.capture.path, settings.capture)
     else:
         studio = resolve("studio/default", kind=StudioSettings)
         folder = default_capture_path(studio)
@@ -58,9 +58,7 @@ def open_capture(settings: Settings, process: Process = Process()) -> Capture:  
                 film_capture(studio, folder, bar.update)
         while not (folder / "capture.yaml").exists():  # other ranks wait for the one that films
             time.sleep(1.0)
-        capture = Capture.open(folder, settings.capture.image_scale)
-    if settings.capture.held_out_cameras:
-        capture.description = dataclasses.replace(capture.description, held_out_cameras=settings.capture.held_out_cameras)
+        capture = open_as_set(folder, settings.capture)
     check_values(capture, load_rig(capture.rig_path))
     return capture
 
@@ -79,14 +77,19 @@ class Fit:
         """Everything before the first step.
 
         Raises:
-            FileNotFoundError, FileExistsError, ValueError: capture, run folder or checkpoint are not usable.
+            FileNotFoundError, FileExistsError, PermissionError, ValueError: capture, run folder or checkpoint are not usable.
         """
+        if process.is_main and not is_resumed:
+            RunFolder.check_free(path)
         capture = open_capture(settings, process)
         rig = load_rig(capture.rig_path)
+        check_trainable(capture, settings, process)
         is_on_gpu = settings.rendering.variant.startswith("cuda")
         join_processes(process, is_on_gpu)
         if is_resumed:
             run = RunFolder.open(path)
+            run.check_capture(capture, rig)
+            run = run.with_settings(settings)
             avatar = run.load_avatar("last").train()
         else:
             with progress_bar("mean texture", 1, is_shown=process.is_main) as bar:
@@ -112,17 +115,20 @@ class Fit:
         """Train to the end; False if the user stopped it, with everything saved."""
         training = self.settings.training
         trainer, is_main = self.trainer, self.process.is_main
-        log = MetricsLog(self.run.log_path, trainer.iteration) if is_main else None
         evaluator, presentation = self._tools(samples_per_pixel=4)
         shots = self._preview_shots()
 
-        with progress_bar("fitting", training.iterations, trainer.iteration, is_main) as bar, interrupts() as is_interrupted:
+        with ExitStack() as stack:
+            is_interrupted = stack.enter_context(interrupts())
+            bar = stack.enter_context(progress_bar("fitting", training.iterations, trainer.iteration, is_main))
+            log = stack.enter_context(MetricsLog(self.run.log_path, trainer.iteration)) if is_main else None
 
-            def after_step(iteration: int, terms: dict[str, float]) -> None:
-                if not is_main:
-                    return
+            def after_step(iteration: int, terms: dict[str, float]) -> bool:
+                is_stopping = trainer.is_any_rank(is_interrupted())
+                if log is None:
+                    return not is_stopping
                 bar.update(iteration, **terms)
-                is_last = iteration == training.iterations or is_interrupted()
+                is_last = iteration == training.iterations or is_stopping
                 psnr = None
                 if iteration % training.validate_every == 0 or is_last:
                     psnr = self._validate(evaluator)
@@ -134,19 +140,15 @@ class Fit:
                     save_image(self.run.previews / f"{iteration:06d}.png", presentation.preview(shots))
                 if iteration % training.checkpoint_every == 0 or is_last:
                     trainer.save(self.run.checkpoints, psnr)
-                if is_interrupted():
-                    raise KeyboardInterrupt
+                return not is_stopping
 
-            try:
-                trainer.run(after_step)
-            except KeyboardInterrupt:
-                return False
-        return True
+            return trainer.run(after_step)
 
     def present(self) -> None:
         """Evaluate the best checkpoint and draw it: metrics, pictures, orbit."""
         evaluation = self.settings.evaluation
         self.avatar.load_state_dict(self.run.checkpoints.load_avatar("best"))
+        self.avatar.eval()
         evaluator, presentation = self._tools(evaluation.samples_per_pixel)
         frames = evaluator.split_frames(evaluation.frames_per_split)
         with progress_bar("evaluating", sum(map(len, frames.values()))) as bar:
@@ -173,14 +175,17 @@ class Fit:
         evaluator = Evaluator(self.avatar, self.reader, renderer)
         return evaluator, Presentation(evaluator, self.run.rig)
 
-    def _validate(self, evaluator: Evaluator) -> float:
-        """PSNR in dB of a few training frames seen by held-out cameras (by training cameras where there are no others)."""
+    def _validate(self, evaluator: Evaluator) -> float | None:
+        """PSNR in dB of a few training frames seen by held-out cameras (by training cameras where there are no others).
+
+        None where none of them sees the person.
+        """
         self.avatar.eval()
         names = self.capture.camera_names(held_out=True) or self.capture.camera_names()
         frames = {"train": evenly_spaced(self.capture.frame_indices("train"), VALIDATION_FRAMES)}
-        means = evaluator.measure(frames, ["avatar"], names).means()["avatar"]["train"]
+        means = evaluator.measure(frames, ["avatar"], names).means()
         self.avatar.train()
-        return next(iter(means.values()))["psnr"]
+        return next(iter(means["avatar"]["train"].values()))["psnr"] if means else None
 
     def _preview_shots(self) -> list[Shot]:
         """A training view, and the held-out cameras' views of two test frames."""
@@ -197,9 +202,8 @@ class Fit:
         evaluation, capture = self.settings.evaluation, self.capture
         split = capture.frame_indices(capture.frames[frames[0]].split)
         along = [split[i * len(split) // evaluation.orbit_frames] for i in range(evaluation.orbit_frames)]
-        with torch.no_grad():
-            points = [self._posed_template(i) for i in evenly_spaced(split, 8)]
-        cameras = orbit(torch.cat(points).numpy()[::37], evaluation.orbit_frames, evaluation.orbit_width, evaluation.orbit_height)
+        points = posed_templates(self.avatar, capture, evenly_spaced(split, 8))
+        cameras = orbit(points, evaluation.orbit_frames, evaluation.orbit_width, evaluation.orbit_height)
         renderer = SurfaceRenderer(
             self.run.rig.topology, evaluation.orbit_width, evaluation.orbit_height, samples_per_pixel=evaluation.samples_per_pixel
         )
@@ -212,11 +216,6 @@ class Fit:
                     yield on_backdrop(radiance, mask)
 
             write_video(self.run.path / "orbit.mp4", pictures(), fps=12)
-
-    def _posed_template(self, index: int) -> torch.Tensor:
-        capture = self.capture
-        theta, root = (torch.from_numpy(values[index : index + 1].copy()) for values in (capture.theta, capture.root))
-        return self.avatar.pose_template(theta, root)[0]
 
 
 def frame_occlusion(settings: Settings, rig: Rig, avatar: Avatar, capture: Capture) -> FrameOcclusion:
@@ -237,18 +236,22 @@ def held_out_shots(capture: Capture, frames: list[int], count: int = 4) -> list[
 
 
 @contextmanager
-def interrupts() -> Iterator:
-    """Turn the first Ctrl-C (or SIGTERM) into a question that the loop asks between steps; a second one stops at once."""
-    asked = threading.Event()
+def interrupts() -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C (or SIGTERM) into a question that the loop asks between steps; a second one stops at once.
+
+    Signals within a second of the first count as one: torchrun passes on the Ctrl-C that the terminal sends to every process anyway.
+    """
+    asked_at = math.inf
 
     def handle(number: int, frame: object) -> None:
-        if asked.is_set():
+        nonlocal asked_at
+        if time.monotonic() > asked_at + 1.0:
             raise KeyboardInterrupt
-        asked.set()
+        asked_at = min(asked_at, time.monotonic())
 
     previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield asked.is_set
+        yield lambda: asked_at < math.inf
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

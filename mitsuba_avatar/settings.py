@@ -192,7 +192,7 @@ class StudioSettings:
     person: Literal["anny"] = "anny"
     train_cameras: int = 10
     held_out_cameras: int = 3
-    width: int = 176
+    width: int = 192
     height: int = 256
     fps: float = 10.0
     train_frames: int = 120

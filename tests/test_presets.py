@@ -106,10 +106,6 @@ def test_bad_presets_are_refused_by_name(tmp_path, text, message):
         (["model.decoder_channels="], "ModelSettings(): expected decoder_channels to be positive; got ()."),
         (["model.texture_size", "200"], "ModelSettings(): expected texture_size to be a power of two; got 200."),
         (["model.geometry_size", "16"], "expected geometry_size to be at least conditioning_size (32)"),
-        (
-            ["model.texture_size", "512"],
-            "expected rendering.ambient_occlusion_size to equal model.texture_size / model.shadow_downscale = 128; got 64.",
-        ),
     ],
 )
 def test_bad_overrides_are_refused_by_name(words, message):

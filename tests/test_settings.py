@@ -2,7 +2,7 @@
 
 import pytest
 
-from mitsuba_avatar.settings import LossSettings, ModelSettings, RenderingSettings, Settings, StudioSettings
+from mitsuba_avatar.settings import LossSettings, ModelSettings, StudioSettings
 
 
 def test_values_given_in_python_are_checked_too():
@@ -14,8 +14,3 @@ def test_values_given_in_python_are_checked_too():
         StudioSettings(name="../x")
 
 
-def test_sections_that_must_agree_are_held_together():
-    with pytest.raises(ValueError, match=r"model\.texture_size / model\.shadow_downscale = 128; got 64"):
-        Settings(model=ModelSettings(texture_size=512))
-    without_shadow = Settings(model=ModelSettings(texture_size=512, use_shadow=False))
-    assert without_shadow.rendering == RenderingSettings()

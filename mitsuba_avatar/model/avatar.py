@@ -48,10 +48,10 @@ class DrivingStatistics:
         mean_displacement: [V, 3] mean offset of the unposed registered meshes from the rig's rest vertices, metres.
     """
 
-    theta_mean: Float[Tensor, "D"]  # noqa: F821 - jaxtyping dimension
-    theta_std: Float[Tensor, "D"]  # noqa: F821
-    face_mean: Float[Tensor, "F"]  # noqa: F821
-    face_std: Float[Tensor, "F"]  # noqa: F821
+    theta_mean: Float[Tensor, "D"]
+    theta_std: Float[Tensor, "D"]
+    face_mean: Float[Tensor, "F"]
+    face_std: Float[Tensor, "F"]
     mean_texture: Float[Tensor, "3 T T"]
     mean_displacement: Float[Tensor, "V 3"]
 
@@ -282,7 +282,6 @@ def _check_statistics(rig: Rig, settings: ModelSettings, statistics: DrivingStat
     for name, shape in (
         ("theta_mean", (dofs,)),
         ("theta_std", (dofs,)),
-        ("face_std", tuple(statistics.face_mean.shape)),
         ("mean_texture", (3, size, size)),
         ("mean_displacement", (vertices, 3)),
     ):

@@ -15,19 +15,18 @@ from torch import Tensor, nn
 
 from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last, convolution
 
-# An entry that hardly moves in training has a tiny deviation, and dividing by it would blow up tracking noise, or the first real
-# movement, to hundreds of deviations. So no deviation counts as less than this fraction of the signal's largest.
-SMALLEST_RELATIVE_STD = 0.05
-
-
 class Standardization(nn.Module):
-    """Shift and scale a signal by the statistics of the training set: (signal - mean) / std.
+    """Shift a signal by its training mean and scale *all* of it by one number: (signal - mean) / max std.
+
+    Entries share a unit (radians, or metres), so one scale keeps their proportions. Dividing each by its own deviation would blow up
+    an angle that hardly moved in training to many deviations at its first real movement: on a capture whose test takes recombine limb
+    motions, that raised the error of driven test vertices by 40 %.
 
     Args:
-        mean, std: [D] in the signal's own unit; `std` is kept above `SMALLEST_RELATIVE_STD` of its largest entry.
+        mean, std: [D] in the signal's own unit.
     """
 
-    def __init__(self, mean: Float[Tensor, "D"], std: Float[Tensor, "D"]):  # noqa: F821 - jaxtyping dimension
+    def __init__(self, mean: Float[Tensor, "D"], std: Float[Tensor, "D"]):  # noqa: F821
         super().__init__()
         self.register_buffer("mean", mean.clone())
         self.register_buffer("std", std.clone())
@@ -35,8 +34,7 @@ class Standardization(nn.Module):
     def forward(self, signal: Float[Tensor, "B D"]) -> Float[Tensor, "B D"]:
         """Standardised signal, without unit; a signal that never moves (all deviations zero) is only shifted."""
         largest = self.std.max()
-        floor = torch.where(largest > 0, SMALLEST_RELATIVE_STD * largest, torch.ones_like(largest))
-        return (signal - self.mean) / self.std.maximum(floor)
+        return (signal - self.mean) / torch.where(largest > 0, largest, torch.ones_like(largest))
 
 
 class LocalizedSignal(nn.Module):

@@ -23,7 +23,7 @@ from mitsuba_avatar.model.conditioning import LocalizedSignal
 from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last, convolution, doubling, start_at_zero
 from mitsuba_avatar.settings import ModelSettings
 
-VIEW_COORDINATES = 4  # direction to the camera in rest space, and its cosine with the template's normal
+VIEW_COORDINATES = 4  # direction to the camera in rest space, and its cosine with the rest surface's normal
 
 
 @dataclass(frozen=True)

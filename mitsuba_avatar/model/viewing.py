@@ -2,8 +2,8 @@
 
 The direction to the camera is turned back to rest space by the texel's own skinning rotation, so that it does not change when body
 and camera move together: a texture can depend on the camera relative to the body part, never on where the body stands. It is taken
-from the posed *template*, as ambient occlusion is: the learnt displacement of a few centimetres turns it by less than a degree, and no
-gradient runs from texture to geometry by way of the view.
+from the rig's own posed surface: what the avatar adds, a few centimetres, turns it by about a degree at most, and no gradient runs from
+texture to geometry by way of the view.
 
 Symbols: S texels along the map, P poses, N cameras a pose. Metres, world axes.
 """
@@ -18,26 +18,26 @@ from mitsuba_avatar.body.uv import UvAtlas
 
 
 class ViewMaps(nn.Module):
-    """View coordinates of every texel: unit direction to the camera in rest space, and its cosine with the template's normal.
+    """View coordinates of every texel: unit direction to the camera in rest space, and its cosine with the rest surface's normal.
 
     Args:
         atlas: texel grid of the maps.
-        template_vertices: [V, 3] rest space, metres.
-        template_normals: [V, 3] unit.
+        rest_vertices: [V, 3] rest space, metres.
+        rest_normals: [V, 3] unit.
         skinning_weights: [V, J] rows sum to 1.
     """
 
     def __init__(
         self,
         atlas: UvAtlas,
-        template_vertices: Float[Tensor, "V 3"],
-        template_normals: Float[Tensor, "V 3"],
+        rest_vertices: Float[Tensor, "V 3"],
+        rest_normals: Float[Tensor, "V 3"],
         skinning_weights: Float[Tensor, "V J"],
     ):
         super().__init__()
         self.size = atlas.size
         positions, normals, weights = (
-            _at_texels(atlas, values) for values in (template_vertices, template_normals, skinning_weights)
+            _at_texels(atlas, values) for values in (rest_vertices, rest_normals, skinning_weights)
         )  # [S * S, ...]
         # Derived from rig and template, hence no part of a checkpoint.
         self.register_buffer("positions", positions, persistent=False)

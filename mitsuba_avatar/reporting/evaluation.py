@@ -56,10 +56,11 @@ class Evaluator:
 
     @torch.no_grad()
     def draw(self, method: str, batch: FrameBatch) -> Drawn:
-        """Draw a batch of one pose with a method of METHODS."""
+        """Draw a batch of one pose with a method of METHODS; what comes back lies in the host's memory."""
         if method == "nearest_frame":
             return self._draw_nearest(batch)
         avatar = self.avatar
+        batch = batch.to(avatar.mean_texture.device)
         if method == "avatar":
             output = avatar.decode(batch.theta, batch.root, batch.face, None, batch.camera_centers, batch.ambient_occlusion)
             vertices, textures = output.vertices, output.textures[0]
@@ -68,7 +69,7 @@ class Evaluator:
             textures = avatar.mean_texture.expand(len(batch.cameras), -1, -1, -1)
         radiance, masks = self.renderer.render(vertices, textures, batch.cameras, seed=batch.frames[0])
         images = encode(radiance + (1 - masks) * batch.backgrounds, "srgb")
-        return Drawn(images.clamp(0, 1), masks, vertices[0])
+        return Drawn(images.clamp(0, 1).cpu(), masks.cpu(), vertices[0].cpu())
 
     def measure(
         self,
@@ -123,5 +124,5 @@ class Evaluator:
 
 
 def as_images(images: Float[Tensor, "B 3 H W"]) -> Float[np.ndarray, "B H W 3"]:
-    """Torch's channel order to numpy's."""
-    return images.permute(0, 2, 3, 1).contiguous().numpy()
+    """Torch's channel order to numpy's, from any device."""
+    return images.permute(0, 2, 3, 1).contiguous().cpu().numpy()

@@ -52,12 +52,12 @@ class Presentation:
         """Panel with a row per shot: capture | render | error | mesh | texture | AO | shadow, driven with a zero latent code."""
         evaluator, previews = self.evaluator, []
         for shot in shots:
-            batch = evaluator.reader.read([shot.frame], [[shot.camera]])
             avatar = evaluator.avatar
+            batch = evaluator.reader.read([shot.frame], [[shot.camera]]).to(avatar.mean_texture.device)
             output = avatar.decode(batch.theta, batch.root, batch.face, None, batch.camera_centers, batch.ambient_occlusion)
             drawn = evaluator.draw("avatar", batch)
             mesh, mask = evaluator.renderer.render(
-                output.vertices, self._shaded(output.vertices, batch.cameras.centers), batch.cameras, seed=shot.frame
+                output.vertices, self._shaded(output.vertices.cpu(), batch.cameras.centers), batch.cameras, seed=shot.frame
             )
             previews.append(
                 Preview(
@@ -65,8 +65,8 @@ class Presentation:
                     render=as_images(drawn.images)[0],
                     mesh=as_images(encode(mesh + (1 - mask) * BACKDROP, "srgb").clamp(0, 1))[0],
                     texture=as_images(encode(output.textures[0].clamp(0, 1), "srgb"))[0],
-                    ambient_occlusion=batch.ambient_occlusion[0, 0].numpy(),
-                    shadow=output.gain[0, 0].clamp(0, 1).numpy(),
+                    ambient_occlusion=batch.ambient_occlusion[0, 0].cpu().numpy(),
+                    shadow=output.gain[0, 0].clamp(0, 1).cpu().numpy(),
                 )
             )
         return preview_panel(previews)
@@ -93,7 +93,9 @@ class Presentation:
 
     def _view(self, shot: Shot, images: Float[Tensor, "1 3 H W"], masks: Float[Tensor, "1 1 H W"]) -> View:
         frame = self.evaluator.capture.frames[shot.frame]
-        return View(f"{shot.camera} {frame.split} {frame.number}", as_images(encode(images, "srgb").clamp(0, 1))[0], masks[0, 0].numpy())
+        return View(
+            f"{shot.camera} {frame.split} {frame.number}", as_images(encode(images, "srgb").clamp(0, 1))[0], masks[0, 0].cpu().numpy()
+        )
 
     def _shaded(self, vertices: Float[Tensor, "P V 3"], centers: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 S S"]:
         """Grey textures lit from each camera: the shape alone."""
@@ -106,7 +108,12 @@ class Presentation:
 
 @torch.no_grad()
 def draw_along(
-    avatar: Avatar, capture: Capture, frames: Sequence[int], cameras: Sequence[Camera], renderer: SurfaceRenderer, occlusion: AmbientOcclusion
+    avatar: Avatar,
+    capture: Capture,
+    frames: Sequence[int],
+    cameras: Sequence[Camera],
+    renderer: SurfaceRenderer,
+    occlusion: AmbientOcclusion,
 ) -> Iterator[tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]]:
     """Drive an avatar with frames of a capture, one camera each, and yield linear radiance (premultiplied) and mask.
 
@@ -118,13 +125,28 @@ def draw_along(
         renderer: of that size.
         occlusion: baker at the avatar's shadow size.
     """
+    device = avatar.mean_texture.device
     for index, camera in zip(frames, cameras, strict=True):
-        theta, root, face = (torch.from_numpy(np.array(values[index], np.float32))[None] for values in (capture.theta, capture.root, capture.face))
+        theta, root, face = (_row(values, index).to(device) for values in (capture.theta, capture.root, capture.face))
         batch = CameraBatch.from_cameras([camera])
-        share = occlusion.bake(avatar.pose_template(theta, torch.eye(4)[None])[0], seed=index)[None, None]
-        output = avatar.decode(theta, root, face, None, batch.centers[None], share)
+        template = avatar.pose_template(theta, torch.eye(4, device=device)[None])[0]
+        share = occlusion.bake(template.cpu(), seed=index)[None, None]
+        output = avatar.decode(theta, root, face, None, batch.centers[None].to(device), share.to(device))
         radiance, mask = renderer.render(output.vertices, output.textures.flatten(0, 1), batch, seed=index)
-        yield as_images(radiance)[0], mask[0, 0].numpy()
+        yield as_images(radiance)[0], mask[0, 0].cpu().numpy()
+
+
+@torch.no_grad()
+def posed_templates(avatar: Avatar, capture: Capture, frames: Sequence[int], every: int = 37) -> Float[np.ndarray, "N 3"]:
+    """Points of the posed template in some frames, every so many vertices: what a camera path must keep in view. Metres, world axes."""
+    device = avatar.mean_texture.device
+    theta, root = (torch.cat([_row(values, i) for i in frames]).to(device) for values in (capture.theta, capture.root))
+    return avatar.pose_template(theta, root)[:, ::every].reshape(-1, 3).cpu().numpy()
+
+
+def _row(values: Float[np.ndarray, "N *shape"], index: int) -> Float[Tensor, "1 *shape"]:
+    """One frame of an array, copied out of the file, as a batch of one."""
+    return torch.from_numpy(np.array(values[index], np.float32))[None]
 
 
 def on_backdrop(radiance: Float[np.ndarray, "H W 3"], mask: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:

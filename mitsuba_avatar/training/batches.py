@@ -4,6 +4,7 @@ What iteration i sees depends on the seed and i alone, so that a resumed run con
 take disjoint slices of one global batch. Symbols: P poses, N views a pose, B = P * N images.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,9 +14,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.captures.arrays import FRAME_ARRAYS
+from mitsuba_avatar.captures.folder import CAMERAS_FILE, Capture
 from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
+from mitsuba_avatar.settings import TrainingSettings
+from mitsuba_avatar.training.distributed import Process
 
 AHEAD = 2  # batches decoded in advance: enough to hide the disk, little memory
 
@@ -49,28 +53,27 @@ class FrameBatch:
     @property
     def camera_centers(self) -> Float[Tensor, "P N 3"]:
         """[P, N, 3] metres, world axes."""
-        return self.cameras.centers.view(len(self.frames), -1, 3)
+        return self.cameras.centers.view(len(self.frames), -1, 3).to(self.theta.device)
+
+    def to(self, device: torch.device) -> "FrameBatch":
+        """The batch with its tensors on a device; cameras stay with the host, which only the renderer's set-up reads."""
+        tensors = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        moved = {name: value.to(device) for name, value in tensors.items() if isinstance(value, Tensor)}
+        return dataclasses.replace(self, **moved)
 
 
 class FrameReader:
     """Reads chosen frames and views of a capture as a batch.
 
     Raises:
-        ValueError: the cameras' images have different sizes, or a driving signal is missing.
+        FileNotFoundError, ValueError: the capture cannot be read as batches; see `check_readable`.
     """
 
     def __init__(self, capture: Capture, occlusion: FrameOcclusion):
+        check_readable(capture)
         self.capture, self.occlusion = capture, occlusion
-        sizes = {(camera.width, camera.height) for camera in capture.cameras.values()}
-        if len(sizes) != 1:
-            raise ValueError(
-                f"FrameReader(): expected one image size for all cameras of {capture.path}; got {sorted(sizes)}. "
-                "Crop or resize the images (and cameras.json) to one size."
-            )
-        ((self.width, self.height),) = sizes
-        missing = [name for name in ("theta", "root", "face") if getattr(capture, name) is None]
-        if missing:
-            raise ValueError(f"FrameReader(): {capture.path} has no {', '.join(missing)}. Add the missing .npy files; see docs/capture.md.")
+        camera = next(iter(capture.cameras.values()))
+        self.width, self.height = camera.width, camera.height
 
     def read(self, frames: list[int], camera_names: list[list[str]]) -> FrameBatch:
         """Decode the images of P frames, N cameras each; raises what `Capture.image` raises, naming the file."""
@@ -99,6 +102,36 @@ class FrameReader:
         )
 
 
+def check_readable(capture: Capture) -> None:
+    """Check that a capture has what a batch holds; opens no image.
+
+    Raises:
+        FileNotFoundError: a driving signal or the masks are missing.
+        ValueError: the cameras' images have different sizes, or a camera is distorted.
+    """
+    missing = [FRAME_ARRAYS[name].file_name for name in ("theta", "root", "face") if getattr(capture, name) is None]
+    if missing:
+        raise FileNotFoundError(
+            f"check_readable(): expected {', '.join(missing)} in {capture.path}; got none. An avatar is driven by them: add the files."
+        )
+    if not (capture.path / "masks").is_dir():
+        raise FileNotFoundError(
+            f"check_readable(): expected masks in {capture.path / 'masks'}; got none. Segment the person in every image first."
+        )
+    sizes = {(camera.width, camera.height) for camera in capture.cameras.values()}
+    if len(sizes) != 1:
+        raise ValueError(
+            f"check_readable(): expected one image size in {capture.path / CAMERAS_FILE}; got {sorted(sizes)}. "
+            "Crop or resize the images (and their cameras) to one size."
+        )
+    distorted = [name for name, camera in capture.cameras.items() if camera.is_distorted]
+    if distorted:
+        raise ValueError(
+            f"check_readable(): expected pinhole cameras in {capture.path / CAMERAS_FILE}; got distortion for {distorted}. "
+            "Undistort the images and leave the coefficients out."
+        )
+
+
 class BatchSampler:
     """Which frames and cameras each iteration sees.
 
@@ -112,9 +145,7 @@ class BatchSampler:
         rank, num_ranks: this process's slice of the poses.
     """
 
-    def __init__(
-        self, frames: list[int], camera_names: list[str], poses: int, views: int, seed: int, rank: int = 0, num_ranks: int = 1
-    ):
+    def __init__(self, frames: list[int], camera_names: list[str], poses: int, views: int, seed: int, rank: int = 0, num_ranks: int = 1):
         if poses % num_ranks:
             raise ValueError(
                 f"BatchSampler(): {poses} poses a batch cannot be shared by {num_ranks} processes. "
@@ -139,6 +170,19 @@ class BatchSampler:
         share = self.poses // self.num_ranks
         own = slice(self.rank * share, (self.rank + 1) * share)
         return frames[own], names[own]
+
+
+def training_sampler(capture: Capture, training: TrainingSettings, process: Process) -> BatchSampler:
+    """The sampler of a fit: training frames, seen by the cameras that are not held out. Raises as `BatchSampler`."""
+    return BatchSampler(
+        capture.frame_indices("train"),
+        capture.camera_names(held_out=False),
+        training.poses_per_batch,
+        training.views_per_pose,
+        training.seed,
+        process.rank,
+        process.num_ranks,
+    )
 
 
 def batches(reader: FrameReader, sampler: BatchSampler, start: int, stop: int) -> Iterator[FrameBatch]:

@@ -9,6 +9,7 @@ checkpoints.json is written after the files that it names, so a crash or a full 
 """
 
 import json
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,14 @@ class Checkpoints:
     def index(self) -> CheckpointIndex | None:
         """What is there; None for a run without a checkpoint."""
         path = self.folder / "checkpoints.json"
-        return CheckpointIndex(**json.loads(path.read_text())) if path.exists() else None
+        if not path.exists():
+            return None
+        try:
+            return CheckpointIndex(**json.loads(path.read_text()))
+        except (ValueError, TypeError) as error:  # no JSON, or other keys
+            raise ValueError(
+                f"Checkpoints: expected last, best and best_psnr in {path}; got: {error}. Restore the file or start the run anew."
+            ) from error
 
     def save(self, avatar_state: dict[str, Tensor], training_state: dict[str, Any], iteration: int, psnr: float | None) -> None:
         """Save a checkpoint as the last, and as the best if `psnr` (dB, None when not measured) beats the best so far.
@@ -55,10 +63,17 @@ class Checkpoints:
         previous = self.index()
         tensors = {name: value.detach().cpu().contiguous().clone() for name, value in avatar_state.items()}
         header = {"rig_fingerprint": self.rig_fingerprint, "iteration": str(iteration)}
-        with atomic_path(self._avatar_path(iteration)) as temporary:
-            save_file(tensors, temporary, metadata=header)
-        with atomic_path(self._training_path(iteration)) as temporary:
-            torch.save(training_state, temporary)
+        try:
+            with atomic_path(self._avatar_path(iteration)) as temporary:
+                save_file(tensors, temporary, metadata=header)
+            with atomic_path(self._training_path(iteration)) as temporary:
+                torch.save(training_state, temporary)
+        except (OSError, SafetensorError, RuntimeError) as error:  # what Python, safetensors and torch raise on a full disk
+            kept = "there is none before it" if previous is None else f"the one of iteration {previous.last} is kept"
+            raise OSError(
+                f"save(): expected room and permission for the checkpoint of iteration {iteration} in {self.folder}; got: {error}. "
+                f"Free disk space, then --resume: {kept}."
+            ) from error
         is_best = previous is None or previous.best_psnr is None or (psnr is not None and psnr > previous.best_psnr)
         best, best_psnr = (iteration, psnr) if is_best else (previous.best, previous.best_psnr)
         with atomic_path(self.folder / "checkpoints.json") as temporary:
@@ -77,13 +92,13 @@ class Checkpoints:
         path = self._avatar_path(self._iteration(which))
         try:
             with safe_open(path, framework="pt") as file:
-                fingerprint = file.metadata()["rig_fingerprint"]
+                fingerprint = (file.metadata() or {}).get("rig_fingerprint", "unknown")
                 if fingerprint != self.rig_fingerprint:
                     raise ValueError(
                         f"load_avatar(): {path} was trained on another rig (fingerprint {fingerprint[:12]}, this rig has "
                         f"{self.rig_fingerprint[:12]}). Use a capture with the rig of the run, or train anew."
                     )
-                return {name: file.get_tensor(name) for name in file.keys()}
+                return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no dictionary
         except (SafetensorError, OSError) as error:
             raise ValueError(f"load_avatar(): {path} cannot be read: {error}. Restore it or start the run anew.") from error
 
@@ -92,14 +107,20 @@ class Checkpoints:
 
         Raises:
             FileNotFoundError: the run has no checkpoint yet.
+            ValueError: the file is missing or damaged.
         """
         iteration = self._iteration("last")
-        return iteration, torch.load(self._training_path(iteration), weights_only=True)
+        path = self._training_path(iteration)
+        try:
+            return iteration, torch.load(path, weights_only=True)
+        except (OSError, EOFError, RuntimeError, pickle.UnpicklingError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ValueError(f"load_training(): {path} cannot be read: {reason}. Restore it or start the run anew.") from error
 
     def _iteration(self, which: str) -> int:
         index = self.index()
         if index is None:
-            raise FileNotFoundError(f"Checkpoints: no checkpoint in {self.folder}. Train first: python -m mitsuba_avatar.fit")
+            raise FileNotFoundError(f"Checkpoints: no checkpoint in {self.folder}. Start the fit again without --resume.")
         return {"last": index.last, "best": index.best}[which]
 
     def _avatar_path(self, iteration: int) -> Path:

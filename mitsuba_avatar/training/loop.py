@@ -8,7 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,11 @@ from torch.nn.parallel import DistributedDataParallel
 from mitsuba_avatar.body.mesh import Laplacian
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.captures.colour import encode
+from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.settings import Settings
-from mitsuba_avatar.training.batches import BatchSampler, FrameBatch, FrameReader, batches
+from mitsuba_avatar.training.batches import FrameBatch, FrameReader, batches, training_sampler
 from mitsuba_avatar.training.checkpoints import Checkpoints
 from mitsuba_avatar.training.distributed import Process
 from mitsuba_avatar.training.losses import LossInputs, evaluate_losses, loss_weights, weighted_sum
@@ -31,8 +32,8 @@ from mitsuba_avatar.training.losses import LossInputs, evaluate_losses, loss_wei
 SEED_STRIDE = 1 << 20  # renderer seeds of different ranks and runs stay apart for a million iterations
 
 
-class DivergedError(RuntimeError):
-    """The loss is not finite; the message names iteration, terms, frames and cameras."""
+class DivergedError(FloatingPointError):
+    """Surface, loss or gradient are not finite; the message names iteration, frames and cameras."""
 
 
 class StepTimer:
@@ -70,7 +71,8 @@ class Trainer:
     def __init__(self, avatar: Avatar, rig: Rig, reader: FrameReader, settings: Settings, process: Process = Process()):  # noqa: B008
         training = settings.training
         self.avatar, self.reader, self.settings, self.process = avatar, reader, settings, process
-        self.model: nn.Module = DistributedDataParallel(avatar) if process.is_distributed else avatar
+        # Buffers are constants (training statistics, tables of the rig): sending them with every step would cost more than gradients.
+        self.model: nn.Module = DistributedDataParallel(avatar, broadcast_buffers=False) if process.is_distributed else avatar
         self.device = next(avatar.parameters()).device
         self.renderer = SurfaceRenderer(
             rig.topology,
@@ -80,35 +82,38 @@ class Trainer:
             boundary_samples_per_edge=settings.rendering.boundary_samples_per_edge,
         )
         self.laplacian = Laplacian(rig.topology).to(self.device)
-        self.optimizer = torch.optim.Adam(avatar.parameters(), lr=training.learning_rate)
-        self.sampler = BatchSampler(
-            reader.capture.frame_indices("train"),
-            [name for name in reader.capture.camera_names(held_out=False)],
-            training.poses_per_batch,
-            training.views_per_pose,
-            training.seed,
-            process.rank,
-            process.num_ranks,
-        )
+        self.optimizer = torch.optim.Adam(avatar.parameters(), lr=training.learning_rate, fused=True)
+        self.sampler = training_sampler(reader.capture, training, process)
         self.iteration = 0
         self.timer = StepTimer()
 
-    def run(self, after_step: Callable[[int, dict[str, float]], None]) -> None:
-        """Train from the current iteration to the last; `after_step(iterations done, loss terms)` reports, saves and may raise to stop."""
-        stream = batches(self.reader, self.sampler, self.iteration, self.settings.training.iterations)
-        while self.iteration < self.settings.training.iterations:
-            with self.timer.part("data"):
-                batch = next(stream)
-            terms = self.step(batch)
-            self.iteration += 1
-            after_step(self.iteration, terms)
-        stream.close()
+    def run(self, after_step: Callable[[int, dict[str, float]], bool]) -> bool:
+        """Train from the current iteration to the last.
+
+        Args:
+            after_step: called as after_step(iterations done, loss terms); reports and saves. Training stops where it returns False.
+
+        Returns:
+            Whether the last iteration was reached.
+        """
+        with closing(batches(self.reader, self.sampler, self.iteration, self.settings.training.iterations)) as stream:
+            while self.iteration < self.settings.training.iterations:
+                with self.timer.part("data"):
+                    batch = next(stream)
+                terms = self.step(batch)
+                self.iteration += 1
+                if not after_step(self.iteration, terms):
+                    return False
+        return True
 
     def step(self, batch: FrameBatch) -> dict[str, float]:
-        """One optimisation step; returns the loss terms, unweighted, and their weighted sum "loss".
+        """One optimisation step.
+
+        Returns:
+            The loss terms, unweighted, and their weighted sum "loss"; means over the ranks of a distributed run.
 
         Raises:
-            DivergedError: a term or a gradient is not finite; nothing was changed.
+            DivergedError: surface, a term or a gradient is not finite; no parameter was changed.
         """
         settings = self.settings
         weights = loss_weights(settings.loss, self.iteration)
@@ -118,30 +123,30 @@ class Trainer:
             weights = {name: weight for name, weight in weights.items() if name not in ("geometry", "laplacian")}
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(self.iteration)
-        device = self.device
-        tracked = None if batch.vertices is None else batch.vertices.to(device)
+        batch = batch.to(self.device)
         with self.timer.part("decoder"):
             output, posterior = self.model(
-                tracked,
-                batch.theta.to(device),
-                batch.root.to(device),
-                batch.face.to(device),
-                batch.camera_centers.to(device),
-                batch.ambient_occlusion.to(device),
-                self.latent_noise(len(batch.frames)).to(device),
+                batch.vertices,
+                batch.theta,
+                batch.root,
+                batch.face,
+                batch.camera_centers,
+                batch.ambient_occlusion,
+                self.latent_noise(len(batch.frames)).to(self.device),
             )
+        self._require_finite("surface", {"vertices": output.vertices.detach().abs().sum()}, batch)
         with self.timer.part("render"):
             seed = (settings.training.seed * self.process.num_ranks + self.process.rank) * SEED_STRIDE + self.iteration
             radiance, mask = self.renderer.render(output.vertices, output.textures.flatten(0, 1), batch.cameras, seed=seed)
-            image = radiance + (1 - mask) * batch.backgrounds.to(device)
+            image = radiance + (1 - mask) * batch.backgrounds
         with self.timer.part("losses"):
             inputs = LossInputs(
                 image=encode(image, "srgb"),
                 mask=mask,
-                target_image=encode(batch.images.to(device), "srgb"),
-                target_mask=batch.masks.to(device),
+                target_image=encode(batch.images, "srgb"),
+                target_mask=batch.masks,
                 vertices=output.vertices,
-                tracked_vertices=tracked,
+                tracked_vertices=batch.vertices,
                 posterior=posterior,
                 laplacian=self.laplacian,
             )
@@ -156,7 +161,12 @@ class Trainer:
         with self.timer.part("optimizer"):
             self.optimizer.step()
         self.timer.steps += 1
-        return {"loss": float(loss.detach()), **{name: float(value.detach()) for name, value in terms.items()}}
+        values = self._mean_over_ranks(torch.stack([loss.detach(), *(value.detach() for value in terms.values())]))
+        return dict(zip(("loss", *terms), values.tolist(), strict=True))
+
+    def is_any_rank(self, flag: bool) -> bool:
+        """Whether the flag is set on at least one rank of the run; all ranks must ask."""
+        return float(self._mean_over_ranks(torch.tensor(float(flag), device=self.device))) > 0
 
     def learning_rate(self, iteration: int) -> float:
         """Cosine from `learning_rate` to `learning_rate_final` over the run."""
@@ -186,6 +196,13 @@ class Trainer:
         self.iteration, state = checkpoints.load_training()
         self.optimizer.load_state_dict(state["optimizer"])
 
+    def _mean_over_ranks(self, values: Tensor) -> Tensor:
+        if self.process.is_distributed:
+            values = values.clone()
+            torch.distributed.all_reduce(values)
+            values /= self.process.num_ranks
+        return values
+
     def _require_finite(self, what: str, values: dict[str, Tensor], batch: FrameBatch) -> None:
         bad = [name for name, value in values.items() if not math.isfinite(float(value))]
         if bad:
@@ -197,11 +214,13 @@ class Trainer:
 
 
 class MetricsLog:
-    """metrics.jsonl of a run: one JSON object a line, appended and flushed, so that a crash loses at most the line being written."""
+    """metrics.jsonl of a run: one JSON object a line, appended and flushed, so that a crash loses at most the line being written.
+
+    Use it as a context manager, or `close` it.
+    """
 
     def __init__(self, path: Path, resume_at: int = 0):
         """Open the log; lines of iterations beyond `resume_at` (written after the checkpoint that is resumed) are dropped."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         kept = []
         if path.exists() and resume_at > 0:
             for line in path.read_text().splitlines():
@@ -211,8 +230,19 @@ class MetricsLog:
                     continue  # the line that a crash cut short
                 if record["iteration"] <= resume_at:
                     kept.append(line)
-        path.write_text("".join(f"{line}\n" for line in kept))
+        with atomic_path(path) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in kept))
         self._file = path.open("a")
+
+    def __enter__(self) -> "MetricsLog":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
     def write(self, record: dict[str, Any]) -> None:
         """Append a record."""

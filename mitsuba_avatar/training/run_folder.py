@@ -13,13 +13,15 @@ metrics.json         what the evaluation measured
 ```
 """
 
+import dataclasses
 import json
 from importlib.metadata import version
 from pathlib import Path
 
 from mitsuba_avatar import __version__
 from mitsuba_avatar.body.rig import Rig, load_rig, save_rig
-from mitsuba_avatar.files import atomic_path
+from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.files import atomic_path, check_writable
 from mitsuba_avatar.model.avatar import Avatar, DrivingStatistics
 from mitsuba_avatar.presets import load_settings, save_settings
 from mitsuba_avatar.settings import Settings
@@ -37,15 +39,23 @@ class RunFolder:
         self.checkpoints = Checkpoints(path / "checkpoints", rig.fingerprint)
 
     @staticmethod
-    def create(path: Path, settings: Settings, rig: Rig, capture_path: Path, face_size: int) -> "RunFolder":
-        """Write the start of a run.
+    def check_free(path: Path) -> None:
+        """Check that a run can be written here, without writing anything.
 
         Raises:
-            FileExistsError: the folder holds a run already.
-            OSError: it cannot be written.
+            FileExistsError: the folder holds a run with a checkpoint.
+            PermissionError: the folder cannot be made or written.
         """
-        if (path / "settings.yaml").exists():
-            raise FileExistsError(f"RunFolder.create(): {path} holds a run. Continue it with --resume, or name another with --run.")
+        if (path / "checkpoints" / "checkpoints.json").exists():
+            raise FileExistsError(
+                f"RunFolder: expected a new run at {path}; got one. Continue it with --resume, or name another with --run."
+            )
+        check_writable(path)
+
+    @staticmethod
+    def create(path: Path, settings: Settings, rig: Rig, capture_path: Path, face_size: int) -> "RunFolder":
+        """Write the start of a run; raises as `check_free`."""
+        RunFolder.check_free(path)
         save_rig(path / "rig.npz", rig)
         facts = {
             "capture": str(capture_path.resolve()),
@@ -63,13 +73,53 @@ class RunFolder:
 
         Raises:
             FileNotFoundError: the folder holds no run.
+            ValueError: a file of it is damaged.
         """
         path = Path(path)
         for name in ("settings.yaml", "rig.npz", "run.json"):
             if not (path / name).exists():
                 raise FileNotFoundError(f"RunFolder.open(): expected a run with {name} in {path}; got none. Name a folder that fit wrote.")
-        facts = json.loads((path / "run.json").read_text())
-        return RunFolder(path, load_settings(path / "settings.yaml"), load_rig(path / "rig.npz"), Path(facts["capture"]), facts["face_size"])
+        settings, rig = load_settings(path / "settings.yaml"), load_rig(path / "rig.npz")
+        try:
+            facts = json.loads((path / "run.json").read_text())
+            return RunFolder(path, settings, rig, Path(facts["capture"]), facts["face_size"])
+        except (ValueError, KeyError) as error:
+            raise ValueError(
+                f"RunFolder.open(): expected capture and face_size in {path / 'run.json'}; got: {error!r}. Restore the file."
+            ) from error
+
+    def check_capture(self, capture: Capture, rig: Rig) -> None:
+        """Check that a capture shows the body that the run was trained on.
+
+        Raises:
+            ValueError: it has another rig, or another face signal.
+        """
+        if rig.fingerprint != self.rig.fingerprint:
+            raise ValueError(
+                f"RunFolder: expected the rig of run {self.path} (fingerprint {self.rig.fingerprint[:12]}) in {capture.rig_path}; "
+                f"got {rig.fingerprint[:12]}. Use a capture of the rig that the avatar was trained on, or train anew."
+            )
+        if capture.face is None or capture.face.shape[1] != self.face_size:
+            got = "none" if capture.face is None else capture.face.shape[1]
+            raise ValueError(
+                f"RunFolder: expected a face signal of {self.face_size} numbers, as run {self.path} was trained on, in {capture.path}; "
+                f"got {got}. Use a capture with the same face signal, or train anew."
+            )
+
+    def with_settings(self, settings: Settings) -> "RunFolder":
+        """The run continued with other settings, which are saved with it.
+
+        Raises:
+            ValueError: the model's settings differ from the trained avatar's.
+        """
+        was, wanted = dataclasses.asdict(self.settings.model), dataclasses.asdict(settings.model)
+        changed = [f"model.{name} {was[name]} -> {wanted[name]}" for name in was if was[name] != wanted[name]]
+        if changed:
+            raise ValueError(
+                f"RunFolder: expected the model of run {self.path}; got {', '.join(changed)}. A trained model keeps its sizes: train anew."
+            )
+        save_settings(self.path / "settings.yaml", settings)
+        return RunFolder(self.path, settings, self.rig, self.capture_path, self.face_size)
 
     def load_avatar(self, which: str = "best") -> Avatar:
         """The avatar of the "best" or "last" checkpoint, ready to be driven (evaluation mode).
@@ -78,8 +128,15 @@ class RunFolder:
             FileNotFoundError, ValueError: no checkpoint, or a damaged one; see `Checkpoints`.
         """
         state = self.checkpoints.load_avatar(which)
-        avatar = Avatar(self.rig, self.settings.model, DrivingStatistics.neutral(self.rig, self.face_size, self.settings.model.texture_size))
-        avatar.load_state_dict(state)
+        model = self.settings.model
+        avatar = Avatar(self.rig, model, DrivingStatistics.neutral(self.rig, self.face_size, model.texture_size))
+        try:
+            avatar.load_state_dict(state)
+        except RuntimeError as error:  # torch lists every tensor that does not fit, a line each
+            raise ValueError(
+                f"load_avatar(): expected weights of the model of {self.path / 'settings.yaml'} in {self.checkpoints.folder}; got others: "
+                f"{' '.join(str(error).split()[:30])} ... Restore settings.yaml, or train anew."
+            ) from error
         return avatar.eval()
 
     @property
