@@ -1,0 +1,99 @@
+"""How the body is painted under its clothes: skin tone, lips, brows, eyes, mouth and nails.
+
+Face coordinates are metres from between the eyes: across (to the person's left), back, up.
+"""
+
+import numpy as np
+
+from mitsuba_avatar.filming.anatomy import HAND, SIDES, Anatomy, smooth_step
+from mitsuba_avatar.filming.canvas import Canvas, Map, Paint
+
+SKIN = (0.50, 0.295, 0.205)
+BLOOD = (0.46, 0.165, 0.125)  # where skin is thin: cheeks, nose, ears, hands
+LIPS = (0.40, 0.145, 0.125)
+LIDS = (0.345, 0.124, 0.094)
+MOUTH = (0.20, 0.055, 0.050)
+NAILS = (0.56, 0.36, 0.29)
+BROWS = (0.070, 0.042, 0.027)
+SCLERA = (0.55, 0.52, 0.49)
+IRIS = (0.075, 0.055, 0.038)
+PUPIL = (0.02, 0.02, 0.02)
+IRIS_EDGE, PUPIL_EDGE = 0.72, 0.29  # radians from the direction of sight; larger than life, so that gaze shows in small images
+
+
+def paint_skin(canvas: Canvas) -> Paint:
+    """The whole body, bare."""
+    anatomy = canvas.anatomy
+    across, back, up = np.moveaxis(canvas.points - _between_eyes(anatomy), -1, 0)
+    head = canvas.field((anatomy.weight(("head",)) > 0.5).astype(np.float64))
+    hands = canvas.field(anatomy.weight(HAND))
+    tone = 1 + 0.045 * canvas.noise(0.11) + 0.03 * canvas.noise(0.022)
+    paint = Paint(np.array(SKIN) * tone[..., None], 0.48 + 0.03 * canvas.noise(0.03) + 0.06 * hands)
+    paint = paint.over(BLOOD, _flush(canvas, head, hands))
+    beard = smooth_step(up, -0.052, -0.075) * smooth_step(np.abs(across), 0.085, 0.05) * smooth_step(back, 0.075, 0.05) * (up > -0.16)
+    paint = paint.over((0.0, 0.0, 0.0), 0.18 * beard * head)
+    rim_of_lids = np.hypot(np.abs(across) - 0.0315, up + 0.001) - 0.0165
+    paint = paint.over(LIDS, 0.25 * head * np.exp(-((rim_of_lids / 0.005) ** 2)) * (back < 0.03))
+    paint = paint.over(BROWS, 0.55 * head * _lash_line(canvas))
+    paint = paint.over(BROWS, 0.85 * head * _brows(canvas, across, back, up))
+    paint = paint.over(LIPS, 0.65 * canvas.mask("lips"), roughness=0.38)
+    paint = paint.over(NAILS, 0.8 * np.maximum(canvas.mask("fingernails"), canvas.mask("toenails")), roughness=0.3)
+    paint = paint.over(MOUTH, np.maximum(canvas.mask("inside-mouth"), canvas.field((anatomy.piece == 1).astype(np.float64))))
+    for side in SIDES:
+        paint = _paint_eye(canvas, paint, side)
+    return paint
+
+
+def _between_eyes(anatomy: Anatomy) -> np.ndarray:
+    return 0.5 * (anatomy.joint("eye.L") + anatomy.joint("eye.R"))
+
+
+def _flush(canvas: Canvas, head: Map, hands: Map) -> Map:
+    """Where blood shows."""
+    eyes = _between_eyes(canvas.anatomy)
+    cheeks = sum(canvas.blob(eyes + np.array([side * 0.043, 0.005, -0.043]), 0.020) for side in (-1, 1))
+    nose = canvas.blob(eyes + np.array([0, -0.045, -0.040]), 0.014)
+    knuckles = hands * (1 + 0.5 * canvas.noise(0.02))
+    return 0.45 * cheeks * head + 0.45 * nose + 0.5 * canvas.mask("ears") + 0.22 * knuckles
+
+
+def _brows(canvas: Canvas, across: Map, back: Map, up: Map) -> Map:
+    """Two arcs of strands above the eyes, the left one a little higher."""
+    side = np.abs(across)
+    rise = 0.006 * np.sin(np.clip((side - 0.012) / 0.045, 0, 1) * np.pi * 0.75)
+    arc = 0.0235 + 0.0011 * np.sign(across) + rise - 0.06 * np.clip(side - 0.043, 0, None)
+    width = 0.0042 * smooth_step(side, 0.062, 0.035) + 0.0008
+    along = smooth_step(side, 0.011, 0.017) * smooth_step(side, 0.060, 0.052)
+    strands = 0.75 + 0.25 * canvas.noise(0.003, stretch=(1.0, 1.0, 0.4))
+    return np.clip(along * np.exp(-(((up - arc) / width) ** 2)) * strands * (back < 0.04), 0, 1)
+
+
+def _lash_line(canvas: Canvas) -> Map:
+    """The eyelids' rims: skin that nearly touches the eyeball's front."""
+    rim = np.zeros((canvas.size, canvas.size))
+    for side in SIDES:
+        offset = canvas.points - canvas.anatomy.joint(f"eye.{side}")
+        rim = np.maximum(rim, smooth_step(np.linalg.norm(offset, axis=-1), 0.0188, 0.0172) * (offset[..., 1] < -0.004))
+    return rim
+
+
+def _paint_eye(canvas: Canvas, paint: Paint, side: str) -> Paint:
+    """White, iris and pupil by the angle from the direction of sight, which at rest is -Y."""
+    anatomy = canvas.anatomy
+    centre = anatomy.joint(f"eye.{side}")
+    pieces = [piece for piece in range(1, anatomy.piece.max() + 1) if _is_around(anatomy, piece, centre)]
+    for piece in pieces:
+        offset = canvas.points - centre
+        distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-6)  # of the centre itself the angle means nothing
+        angle = np.arccos(np.clip(-offset[..., 1] / distance, -1, 1))
+        white = np.array(SCLERA) * (1 - 0.12 * smooth_step(angle, 0.5, 1.2))[..., None]
+        eye = Paint(white, np.full_like(angle, 0.12))
+        eye = eye.over(IRIS, smooth_step(angle, IRIS_EDGE + 0.12, IRIS_EDGE - 0.12))
+        eye = eye.over(PUPIL, smooth_step(angle, PUPIL_EDGE + 0.07, PUPIL_EDGE - 0.07))
+        paint = paint.under(eye, canvas.field((anatomy.piece == piece).astype(np.float64)))
+    return paint
+
+
+def _is_around(anatomy: Anatomy, piece: int, centre: np.ndarray) -> bool:
+    """Whether a piece of the surface is the ball around an eye's joint."""
+    return bool(np.linalg.norm(anatomy.rig.rest_vertices[anatomy.piece == piece].mean(axis=0) - centre) < 0.02)
