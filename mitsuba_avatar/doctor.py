@@ -16,7 +16,26 @@ import tyro
 
 from mitsuba_avatar.rendering import backend
 
-PACKAGES = ("mitsuba", "drjit", "torch", "numpy", "anny", "trimesh", "OpenEXR", "colour-science", "av", "pillow")
+# The distributions that pyproject.toml asks for.
+PACKAGES = (
+    "mitsuba",
+    "drjit",
+    "torch",
+    "numpy",
+    "scipy",
+    "anny",
+    "trimesh",
+    "OpenEXR",
+    "colour-science",
+    "av",
+    "pillow",
+    "matplotlib",
+    "safetensors",
+    "jaxtyping",
+    "tyro",
+    "pyyaml",
+    "rich",
+)
 
 
 @dataclass(frozen=True)

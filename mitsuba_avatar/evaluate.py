@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from mitsuba_avatar.files import check_writable
 from mitsuba_avatar.rendering import backend
 
 
@@ -20,7 +21,7 @@ class EvaluateCommand:
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
     capture: str = ""  # another capture of the same rig; default: the one it was trained on
     frames: int = 0  # frames per split; default: the run's setting evaluation.frames_per_split
-    checkpoint: str = "best"  # best or last
+    checkpoint: str = "last"  # best or last
     output: str = ""  # where metrics go; default: RUN/metrics.json
     variant: str = "auto"  # Mitsuba variant
 
@@ -29,6 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(EvaluateCommand, args=arguments)
     try:
+        if command.frames < 0:
+            raise ValueError(f"expected --frames of at least 1, or 0 for the run's own number; got {command.frames}.")
         backend.select_variant(command.variant)
         return _evaluate(command)
     except (ValueError, OSError, backend.BackendError) as error:
@@ -43,11 +46,13 @@ def _evaluate(command: EvaluateCommand) -> int:
     from mitsuba_avatar.reporting.tables import terminal_table
 
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
+    output = Path(command.output) if command.output else loaded.run.metrics_path
+    check_writable(output.parent)
     evaluator = loaded.evaluator()
     frames = evaluator.split_frames(command.frames or loaded.run.settings.evaluation.frames_per_split)
     with progress_bar("evaluating", sum(map(len, frames.values()))) as bar:
         metrics = evaluator.measure(frames, progress=bar.update)
-    metrics.save(command.output or loaded.run.metrics_path)
+    metrics.save(output)
     sys.stdout.write(terminal_table(metrics.means()) + "\n")
     return 0
 

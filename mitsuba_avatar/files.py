@@ -26,6 +26,21 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def check_writable(folder: Path | str) -> None:
+    """Check that files can be written into a folder that may not exist yet; makes nothing.
+
+    Raises:
+        PermissionError: the folder, or the nearest one above it that exists, cannot be written.
+    """
+    existing = Path(folder).absolute()
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        raise PermissionError(f"check_writable(): expected a folder at {folder}; got {existing}, which is a file. Name another place.")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise PermissionError(f"check_writable(): expected permission to write into {existing}; got none. Name another place.")
+
+
 def cache_folder() -> Path:
     """Folder for things made once and reused: the built rig, the embedded default capture.
 

@@ -26,7 +26,7 @@ from mitsuba_avatar.reporting.camera_paths import orbit
 from mitsuba_avatar.reporting.evaluation import Evaluator
 from mitsuba_avatar.reporting.figures import loss_curves, save_image
 from mitsuba_avatar.reporting.metrics import read_records
-from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, on_backdrop, posed_templates
+from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, on_backdrop, posed_corners
 from mitsuba_avatar.reporting.tables import terminal_table
 from mitsuba_avatar.reporting.video import write_video
 from mitsuba_avatar.settings import Settings, StudioSettings
@@ -145,9 +145,12 @@ class Fit:
             return trainer.run(after_step)
 
     def present(self) -> None:
-        """Evaluate the best checkpoint and draw it: metrics, pictures, orbit."""
+        """Evaluate the avatar and draw it: metrics, pictures, orbit.
+
+        The last checkpoint is measured, not the best: the best is chosen by held-out cameras, and would flatter their figures.
+        """
         evaluation = self.settings.evaluation
-        self.avatar.load_state_dict(self.run.checkpoints.load_avatar("best"))
+        self.avatar.load_state_dict(self.run.checkpoints.load_avatar("last"))
         self.avatar.eval()
         evaluator, presentation = self._tools(evaluation.samples_per_pixel)
         frames = evaluator.split_frames(evaluation.frames_per_split)
@@ -202,8 +205,8 @@ class Fit:
         evaluation, capture = self.settings.evaluation, self.capture
         split = capture.frame_indices(capture.frames[frames[0]].split)
         along = [split[i * len(split) // evaluation.orbit_frames] for i in range(evaluation.orbit_frames)]
-        points = posed_templates(self.avatar, capture, evenly_spaced(split, 8))
-        cameras = orbit(points, evaluation.orbit_frames, evaluation.orbit_width, evaluation.orbit_height)
+        corners = posed_corners(self.avatar, capture, along)
+        cameras = orbit(corners, evaluation.orbit_frames, evaluation.orbit_width, evaluation.orbit_height)
         renderer = SurfaceRenderer(
             self.run.rig.topology, evaluation.orbit_width, evaluation.orbit_height, samples_per_pixel=evaluation.samples_per_pixel
         )
@@ -215,7 +218,7 @@ class Fit:
                     bar.update(done + 1)
                     yield on_backdrop(radiance, mask)
 
-            write_video(self.run.path / "orbit.mp4", pictures(), fps=12)
+            write_video(self.run.path / "orbit.mp4", pictures(), fps=12.0)
 
 
 def frame_occlusion(settings: Settings, rig: Rig, avatar: Avatar, capture: Capture) -> FrameOcclusion:

@@ -4,12 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mitsuba_avatar.body.rig import load_rig
+from mitsuba_avatar.captures.checks import check_arrays
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion, FrameOcclusion
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.reporting.evaluation import Evaluator
-from mitsuba_avatar.training.batches import FrameReader
+from mitsuba_avatar.training.batches import FrameReader, check_driving
+from mitsuba_avatar.training.readiness import open_as_set
 from mitsuba_avatar.training.run_folder import RunFolder
 
 
@@ -22,7 +24,7 @@ class LoadedRun:
     capture: Capture
 
     @staticmethod
-    def open(path: Path | str, capture_path: str = "", checkpoint: str = "best") -> "LoadedRun":
+    def open(path: Path | str, capture_path: str = "", checkpoint: str = "last") -> "LoadedRun":
         """Open a run.
 
         Args:
@@ -32,17 +34,16 @@ class LoadedRun:
 
         Raises:
             FileNotFoundError: run, checkpoint or capture are not there.
-            ValueError: the capture has another rig, or a file is damaged.
+            ValueError: the capture has another rig or face signal, or a file is damaged.
         """
         if checkpoint not in ("best", "last"):
             raise ValueError(f"LoadedRun.open(): expected checkpoint 'best' or 'last'; got {checkpoint!r}.")
         run = RunFolder.open(path)
-        capture = Capture.open(capture_path or run.capture_path, run.settings.capture.image_scale)
-        if load_rig(capture.rig_path).fingerprint != run.rig.fingerprint:
-            raise ValueError(
-                f"LoadedRun.open(): capture {capture.path} has another rig than run {run.path}. "
-                "Drive the avatar with a capture of the rig it was trained on."
-            )
+        capture = open_as_set(capture_path or run.capture_path, run.settings.capture)
+        rig = load_rig(capture.rig_path)
+        run.check_capture(capture, rig)
+        check_driving(capture)
+        check_arrays(capture, rig)
         return LoadedRun(run, run.load_avatar(checkpoint), capture)
 
     def occlusion(self) -> AmbientOcclusion:

@@ -37,7 +37,9 @@ class ProgressBar:
             self._logged = now
             rate = (done - self._initial) / max(now - self._started, 1e-6)
             left = (self._total - done) / rate if rate > 0 else float("inf")
-            self._console.print(f"{self._description}: {done}/{self._total}  {_rate(rate)}  {left:.0f} s left  {text}", highlight=False)
+            self._console.print(
+                f"{self._description}: {done}/{self._total}  {_rate(rate)}  {left:.0f} s left  {text}", highlight=False, soft_wrap=True
+            )
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from mitsuba_avatar.files import check_writable
 from mitsuba_avatar.rendering import backend
 
 
@@ -26,7 +27,7 @@ class RenderCommand:
     width: int = 360  # of an orbit; held-out cameras keep their size
     height: int = 540
     capture: str = ""  # driving capture of the same rig; default: the run's
-    checkpoint: str = "best"  # best or last
+    checkpoint: str = "last"  # best or last
     output: str = ""  # folder; default: RUN/renders/<path>
     variant: str = "auto"  # Mitsuba variant
 
@@ -53,17 +54,16 @@ def _render(command: RenderCommand) -> Path:
     from mitsuba_avatar.reporting.camera_paths import orbit
     from mitsuba_avatar.reporting.exr import write_exr
     from mitsuba_avatar.reporting.figures import save_image
-    from mitsuba_avatar.reporting.presentation import Shot, draw_along, on_backdrop, posed_templates
+    from mitsuba_avatar.reporting.presentation import Shot, draw_along, on_backdrop, posed_corners
     from mitsuba_avatar.reporting.video import write_video
-    from mitsuba_avatar.training.statistics import evenly_spaced
 
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
     capture = loaded.capture
     split = capture.frame_indices(command.split)
     frames = [split[i * len(split) // command.frames] for i in range(command.frames)]  # repeats where pictures outnumber frames
     if command.path == "orbit":
-        points = posed_templates(loaded.avatar, capture, evenly_spaced(frames, 8))
-        cameras = orbit(points, len(frames), command.width, command.height)
+        corners = posed_corners(loaded.avatar, capture, frames)
+        cameras = orbit(corners, len(frames), command.width, command.height)
         names = [camera.name for camera in cameras]
         shots = [Shot(frame, name) for frame, name in zip(frames, names, strict=True)]
     else:
@@ -72,13 +72,17 @@ def _render(command: RenderCommand) -> Path:
             raise ValueError(f"{capture.path} has no held-out cameras. Use --path orbit, or list some in capture.yaml.")
         shots = [Shot(frame, names[i % len(names)]) for i, frame in enumerate(frames)]
         cameras = [capture.cameras[shot.camera] for shot in shots]
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(sizes) > 1:
+        raise ValueError(f"expected held-out cameras of one image size in {capture.path}; got {sorted(sizes)}. Use --path orbit.")
     renderer = loaded.renderer(cameras[0].width, cameras[0].height)
     folder = Path(command.output) if command.output else loaded.run.path / "renders" / command.path
+    check_writable(folder)
     with progress_bar("rendering", len(frames)) as bar:
         drawn = draw_along(loaded.avatar, capture, frames, cameras, renderer, loaded.occlusion())
         if command.format == "mp4":
             output = folder.with_suffix(".mp4")
-            write_video(output, (on_backdrop(*picture) for picture in _counted(drawn, bar)), fps=12)
+            write_video(output, (on_backdrop(*picture) for picture in _counted(drawn, bar)), fps=12.0)
             return output
         for shot, (radiance, mask) in zip(shots, _counted(drawn, bar), strict=True):
             path = folder / f"{shot.camera}_{capture.frames[shot.frame].number:06d}.{command.format}"

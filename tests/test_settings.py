@@ -12,5 +12,3 @@ def test_values_given_in_python_are_checked_too():
         ModelSettings(latent_size=0)
     with pytest.raises(ValueError, match="it names a folder; got '../x'"):
         StudioSettings(name="../x")
-
-

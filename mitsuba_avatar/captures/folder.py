@@ -23,7 +23,7 @@ from PIL import Image
 
 from mitsuba_avatar.captures.arrays import FRAME_ARRAYS, open_frame_array
 from mitsuba_avatar.captures.cameras import Camera, load_cameras
-from mitsuba_avatar.captures.colour import decode, decode_bytes
+from mitsuba_avatar.captures.colour import decode, decode_bytes, encode
 from mitsuba_avatar.captures.description import CaptureDescription, load_description
 from mitsuba_avatar.captures.frames import Frame, load_frames
 from mitsuba_avatar.captures.images import EncodedImage, read_image, read_mask
@@ -130,6 +130,16 @@ class Capture:
         """Linear values of an image [H, W, 3], where 1 is the file's white; at the size of `cameras`. Raises as `encoded_image`."""
         return self._linear(self.encoded_image(camera_name, frame_index), camera_name)
 
+    def display_image(self, camera_name: str, frame_index: int) -> Float32[np.ndarray, "H W 3"]:
+        """Display-encoded (sRGB) values of an image [H, W, 3], at the size of `cameras`; as stored, where the file holds just that.
+
+        Raises as `encoded_image`.
+        """
+        stored = self.encoded_image(camera_name, frame_index)
+        if self.description.colour_curve == "srgb" and self.image_scale == 1.0:
+            return stored.astype(np.float32) / np.float32(255.0)
+        return encode(self._linear(stored, camera_name), "srgb")
+
     def mask(self, camera_name: str, frame_index: int) -> Float32[np.ndarray, "H W"]:
         """Coverage of the person [H, W], 0 background to 1 person; at the size of `cameras`. Raises as `encoded_image`."""
         path = self.mask_path(camera_name, frame_index)
@@ -200,7 +210,7 @@ class Capture:
                 f"{shape[1]}x{shape[0]}. Store the camera at the images' size (Camera.resized scales the intrinsics)."
             )
 
-    def _linear(self, pixels: EncodedImage, camera_name: str) -> Float32[np.ndarray, "H W 3"]:
+    def _linear(self, pixels: EncodedImage, camera_name: str) -> Float32[np.ndarray, "h w 3"]:
         """Pixels of a file as linear values at the size of `cameras`."""
         curve = self.description.colour_curve
         return self._resampled(decode_bytes(pixels, curve) if pixels.dtype == np.uint8 else decode(pixels, curve), camera_name)

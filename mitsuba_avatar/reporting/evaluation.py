@@ -93,7 +93,7 @@ class Evaluator:
         for split, indices in frames.items():
             for index in indices:
                 batch = self.reader.read([index], [names])
-                references, masks = as_images(encode(batch.images, "srgb").clamp(0, 1)), batch.masks[:, 0].numpy()
+                references, masks = as_images(batch.images), batch.masks[:, 0].numpy()
                 for method in methods:
                     drawn = self.draw(method, batch)
                     images = as_images(drawn.images)
@@ -120,7 +120,7 @@ class Evaluator:
         distance = np.linalg.norm(self.capture.theta[candidates] - batch.theta.numpy(), axis=1)
         nearest = self.reader.read([candidates[int(distance.argmin())]], batch.camera_names)
         vertices = None if nearest.vertices is None else nearest.vertices[0]
-        return Drawn(encode(nearest.images, "srgb").clamp(0, 1), nearest.masks, vertices)
+        return Drawn(nearest.images, nearest.masks, vertices)
 
 
 def as_images(images: Float[Tensor, "B 3 H W"]) -> Float[np.ndarray, "B H W 3"]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from mitsuba_avatar.body.mesh import vertex_normals
@@ -94,7 +95,7 @@ class Presentation:
     def _view(self, shot: Shot, images: Float[Tensor, "1 3 H W"], masks: Float[Tensor, "1 1 H W"]) -> View:
         frame = self.evaluator.capture.frames[shot.frame]
         return View(
-            f"{shot.camera} {frame.split} {frame.number}", as_images(encode(images, "srgb").clamp(0, 1))[0], masks[0, 0].cpu().numpy()
+            f"{shot.camera} {frame.split} {frame.number}", as_images(images)[0], masks[0, 0].cpu().numpy()
         )
 
     def _shaded(self, vertices: Float[Tensor, "P V 3"], centers: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 S S"]:
@@ -106,7 +107,6 @@ class Presentation:
         return (0.04 + 0.6 * facing).expand(-1, 3, -1, -1)
 
 
-@torch.no_grad()
 def draw_along(
     avatar: Avatar,
     capture: Capture,
@@ -129,19 +129,32 @@ def draw_along(
     for index, camera in zip(frames, cameras, strict=True):
         theta, root, face = (_row(values, index).to(device) for values in (capture.theta, capture.root, capture.face))
         batch = CameraBatch.from_cameras([camera])
-        template = avatar.pose_template(theta, torch.eye(4, device=device)[None])[0]
-        share = occlusion.bake(template.cpu(), seed=index)[None, None]
-        output = avatar.decode(theta, root, face, None, batch.centers[None].to(device), share.to(device))
-        radiance, mask = renderer.render(output.vertices, output.textures.flatten(0, 1), batch, seed=index)
+        with torch.no_grad():  # left before the yield: the caller's own gradients are not this function's business
+            template = avatar.pose_template(theta, torch.eye(4, device=device)[None])[0]
+            share = occlusion.bake(template.cpu(), seed=index)[None, None]
+            output = avatar.decode(theta, root, face, None, batch.centers[None].to(device), share.to(device))
+            radiance, mask = renderer.render(output.vertices, output.textures.flatten(0, 1), batch, seed=index)
         yield as_images(radiance)[0], mask[0, 0].cpu().numpy()
 
 
 @torch.no_grad()
-def posed_templates(avatar: Avatar, capture: Capture, frames: Sequence[int], every: int = 37) -> Float[np.ndarray, "N 3"]:
-    """Points of the posed template in some frames, every so many vertices: what a camera path must keep in view. Metres, world axes."""
-    device = avatar.mean_texture.device
-    theta, root = (torch.cat([_row(values, i) for i in frames]).to(device) for values in (capture.theta, capture.root))
-    return avatar.pose_template(theta, root)[:, ::every].reshape(-1, 3).cpu().numpy()
+def posed_corners(avatar: Avatar, capture: Capture, frames: Sequence[int]) -> Float[np.ndarray, "N 3"]:
+    """Corners of the convex hull of the posed template in some frames: a camera that has them in view sees all of it.
+
+    Args:
+        avatar: whose template is posed.
+        capture: whose theta and root pose it.
+        frames: frame indices; a repeated one counts once.
+
+    Returns:
+        [N, 3] metres, world axes.
+    """
+    device, corners = avatar.mean_texture.device, np.zeros((0, 3), np.float32)
+    for index in sorted(set(frames)):
+        template = avatar.pose_template(_row(capture.theta, index).to(device), _row(capture.root, index).to(device))[0]
+        points = np.concatenate([corners, template.cpu().numpy()])
+        corners = points[ConvexHull(points).vertices]
+    return corners
 
 
 def _row(values: Float[np.ndarray, "N *shape"], index: int) -> Float[Tensor, "1 *shape"]:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mitsuba_avatar.captures.arrays import FRAME_ARRAYS
+from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.captures.folder import CAMERAS_FILE, Capture
 from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
@@ -34,7 +35,8 @@ class FrameBatch:
         theta: [P, D] radians. root: [P, 4, 4]. face: [P, F].
         vertices: [P, V, 3] registered mesh, metres; None where the capture has none.
         ambient_occlusion: [P, 1, S, S].
-        images: [B, 3, H, W] linear radiance. masks: [B, 1, H, W]. backgrounds: [B, 3, H, W] linear radiance.
+        images: [B, 3, H, W] display-encoded (sRGB), as losses and metrics compare them. masks: [B, 1, H, W].
+        backgrounds: [B, 3, H, W] linear radiance.
         cameras: B cameras.
     """
 
@@ -83,7 +85,10 @@ class FrameReader:
             for name in names:
                 mask = capture.mask(name, frame)
                 background = capture.background(name)
-                images.append(composited(capture.image(name, frame), mask, background))
+                is_known = background is not None  # on black otherwise
+                images.append(
+                    capture.display_image(name, frame) if is_known else encode(composited(capture.image(name, frame), mask, None), "srgb")
+                )
                 masks.append(mask)
                 backgrounds.append(np.zeros((self.height, self.width, 3), np.float32) if background is None else background)
                 cameras.append(capture.cameras[name])
@@ -102,6 +107,19 @@ class FrameReader:
         )
 
 
+def check_driving(capture: Capture) -> None:
+    """Check that a capture can drive an avatar.
+
+    Raises:
+        FileNotFoundError: a driving signal is missing.
+    """
+    missing = [FRAME_ARRAYS[name].file_name for name in ("theta", "root", "face") if getattr(capture, name) is None]
+    if missing:
+        raise FileNotFoundError(
+            f"check_driving(): expected {', '.join(missing)} in {capture.path}; got none. An avatar is driven by them: add the files."
+        )
+
+
 def check_readable(capture: Capture) -> None:
     """Check that a capture has what a batch holds; opens no image.
 
@@ -109,11 +127,7 @@ def check_readable(capture: Capture) -> None:
         FileNotFoundError: a driving signal or the masks are missing.
         ValueError: the cameras' images have different sizes, or a camera is distorted.
     """
-    missing = [FRAME_ARRAYS[name].file_name for name in ("theta", "root", "face") if getattr(capture, name) is None]
-    if missing:
-        raise FileNotFoundError(
-            f"check_readable(): expected {', '.join(missing)} in {capture.path}; got none. An avatar is driven by them: add the files."
-        )
+    check_driving(capture)
     if not (capture.path / "masks").is_dir():
         raise FileNotFoundError(
             f"check_readable(): expected masks in {capture.path / 'masks'}; got none. Segment the person in every image first."

@@ -4,6 +4,7 @@ Everything random in iteration i follows from the base seed and i, so that a res
 to the order of float sums. Source: arXiv:2105.10441, section 3.6.
 """
 
+import inspect
 import json
 import math
 import time
@@ -71,8 +72,7 @@ class Trainer:
     def __init__(self, avatar: Avatar, rig: Rig, reader: FrameReader, settings: Settings, process: Process = Process()):  # noqa: B008
         training = settings.training
         self.avatar, self.reader, self.settings, self.process = avatar, reader, settings, process
-        # Buffers are constants (training statistics, tables of the rig): sending them with every step would cost more than gradients.
-        self.model: nn.Module = DistributedDataParallel(avatar, broadcast_buffers=False) if process.is_distributed else avatar
+        self.model: nn.Module = _data_parallel(avatar) if process.is_distributed else avatar
         self.device = next(avatar.parameters()).device
         self.renderer = SurfaceRenderer(
             rig.topology,
@@ -143,7 +143,7 @@ class Trainer:
             inputs = LossInputs(
                 image=encode(image, "srgb"),
                 mask=mask,
-                target_image=encode(batch.images, "srgb"),
+                target_image=batch.images,
                 target_mask=batch.masks,
                 vertices=output.vertices,
                 tracked_vertices=batch.vertices,
@@ -211,6 +211,17 @@ class Trainer:
                 f"step(): {what} {', '.join(bad)} is not finite at iteration {self.iteration}, frames {numbers}, cameras "
                 f"{batch.camera_names}. Lower training.learning_rate, or check these images; --resume continues from the last checkpoint."
             )
+
+
+def _data_parallel(avatar: Avatar) -> DistributedDataParallel:
+    """The avatar with its gradients averaged over the ranks.
+
+    Buffers are constants (training statistics, tables of the rig): sending them with every step would cost more than the gradients.
+    """
+    options = inspect.signature(DistributedDataParallel).parameters
+    # The option's name since torch 2.13; older versions know the second one alone, newer ones warn of it.
+    name = "forward_sync_buffers" if "forward_sync_buffers" in options else "broadcast_buffers"
+    return DistributedDataParallel(avatar, **{name: False})
 
 
 class MetricsLog:

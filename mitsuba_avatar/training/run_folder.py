@@ -121,7 +121,7 @@ class RunFolder:
         save_settings(self.path / "settings.yaml", settings)
         return RunFolder(self.path, settings, self.rig, self.capture_path, self.face_size)
 
-    def load_avatar(self, which: str = "best") -> Avatar:
+    def load_avatar(self, which: str = "last") -> Avatar:
         """The avatar of the "best" or "last" checkpoint, ready to be driven (evaluation mode).
 
         Raises:

@@ -1,0 +1,89 @@
+"""Measuring an avatar: the baselines are what they say, and every number is filed where it belongs."""
+
+import numpy as np
+import pytest
+import torch
+
+from mitsuba_avatar.captures.colour import encode
+from mitsuba_avatar.reporting.evaluation import METHODS, as_images
+from mitsuba_avatar.reporting.metrics import image_metrics, silhouette_iou
+from tests.drawn_capture import BACKGROUND, HEIGHT, HELD_OUT, TRAIN_FRAMES, WIDTH
+
+VIEWS = ["left", HELD_OUT, "front"]
+
+
+def test_all_methods_draw_display_values(evaluator):
+    batch = evaluator.reader.read([8], [VIEWS])
+    for method in METHODS:
+        drawn = evaluator.draw(method, batch)
+        assert drawn.images.shape == (3, 3, HEIGHT, WIDTH) and drawn.masks.shape == (3, 1, HEIGHT, WIDTH)
+        assert drawn.images.min() >= 0 and drawn.images.max() <= 1 and not drawn.images.requires_grad
+        corner = encode(torch.tensor(BACKGROUND), "srgb")
+        torch.testing.assert_close(drawn.images[1, :, 0, 0], corner, atol=3e-3, rtol=0, msg="composited on the capture's background")
+
+
+def test_the_template_is_the_avatar_before_training(evaluator, loaded):
+    batch = evaluator.reader.read([3], [VIEWS])
+    drawn = evaluator.draw("template_mean_texture", batch)
+    torch.testing.assert_close(drawn.vertices, loaded.avatar.pose_template(batch.theta, batch.root)[0].detach())
+    assert (drawn.images - evaluator.draw("avatar", batch).images).abs().max() > 0.02
+
+
+def test_the_nearest_frame_is_the_nearest_other_training_frame(evaluator, drawn_capture):
+    for index in (0, 4, 9):
+        batch = evaluator.reader.read([index], [VIEWS])
+        drawn = evaluator.draw("nearest_frame", batch)
+        distance = np.linalg.norm(drawn_capture.theta[:TRAIN_FRAMES] - drawn_capture.theta[index], axis=1)
+        distance[distance == 0] = np.inf
+        nearest = int(distance.argmin())
+        assert nearest != index
+        for view, name in enumerate(VIEWS):
+            expected = encode(drawn_capture.image(name, nearest), "srgb")
+            np.testing.assert_allclose(as_images(drawn.images)[view], expected, atol=1e-6)
+            np.testing.assert_array_equal(drawn.masks[view, 0], drawn_capture.mask(name, nearest))
+
+
+def test_numbers_are_those_of_the_single_pictures(evaluator, drawn_capture):
+    """Two frames and two cameras, averaged by hand."""
+    frames, names = [2, 5], ["right", "back"]
+    means = evaluator.measure({"train": frames}, ["avatar"], names).means()["avatar"]["train"]
+    expected = {"psnr": [], "l1": [], "iou": []}
+    for index in frames:
+        batch = evaluator.reader.read([index], [names])
+        drawn = evaluator.draw("avatar", batch)
+        for view, name in enumerate(names):
+            mask = drawn_capture.mask(name, index)
+            values = image_metrics(as_images(drawn.images)[view], encode(drawn_capture.image(name, index), "srgb"), mask)
+            expected["psnr"].append(values["psnr"])
+            expected["l1"].append(values["l1"])
+            expected["iou"].append(silhouette_iou(drawn.masks[view, 0].numpy(), mask))
+    assert list(means) == ["seen"] and means["seen"]["images"] == 4
+    for name, values in expected.items():
+        assert means["seen"][name] == pytest.approx(np.mean(values), rel=1e-5), name
+
+
+def test_cameras_and_splits_are_told_apart(evaluator):
+    calls = []
+    means = evaluator.measure(
+        {"train": [0], "test": [8, 9]}, ["template_mean_texture"], progress=lambda done, total: calls.append((done, total))
+    ).means()["template_mean_texture"]
+    images = {(split, cameras): values["images"] for split, group in means.items() for cameras, values in group.items()}
+    assert images == {("train", "seen"): 4, ("train", "held_out"): 1, ("test", "seen"): 8, ("test", "held_out"): 2}
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_cameras_that_see_nobody_are_left_out(evaluator, monkeypatch):
+    read = evaluator.reader.read
+
+    def without_person(frames, camera_names):
+        batch = read(frames, camera_names)
+        batch.masks[1] = 0
+        return batch
+
+    monkeypatch.setattr(evaluator.reader, "read", without_person)
+    means = evaluator.measure({"test": [8]}, ["avatar"], VIEWS).means()
+    assert list(means["avatar"]["test"]) == ["seen"] and means["avatar"]["test"]["seen"]["images"] == 2
+
+
+def test_frames_of_a_split_are_spread_evenly(evaluator):
+    assert evaluator.split_frames(3) == {"train": [0, 4, 7], "test": [8, 9]}

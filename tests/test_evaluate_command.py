@@ -1,0 +1,77 @@
+"""`python -m mitsuba_avatar.evaluate`: the table and metrics.json of a finished run, and what it says about bad input."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from mitsuba_avatar.evaluate import main
+from mitsuba_avatar.reporting.evaluation import METHODS
+from mitsuba_avatar.reporting.metrics import load_metrics
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_evaluation_repeats_what_the_fit_measured(fitted_run, private_cache, tmp_path, capsys):
+    assert main([str(fitted_run), "--output", str(tmp_path / "metrics.json")]) == 0
+    again, first = load_metrics(tmp_path / "metrics.json"), load_metrics(fitted_run / "metrics.json")
+    for method in METHODS:
+        for split in ("train", "test"):
+            for cameras in ("seen", "held_out"):
+                for name, value in first[method][split][cameras].items():
+                    assert again[method][split][cameras][name] == pytest.approx(value, rel=1e-3, abs=1e-3), (method, split, cameras, name)
+    table = capsys.readouterr().out
+    assert all(f"{method} " in table for method in METHODS) and "held_out" in table and "PSNR (dB)" in table
+
+
+def test_frames_and_checkpoint_can_be_chosen(fitted_run, private_cache, tmp_path):
+    shutil.copytree(fitted_run, tmp_path / "run")
+    assert main([str(tmp_path / "run"), "--frames", "1", "--checkpoint", "last"]) == 0
+    assert load_metrics(tmp_path / "run/metrics.json")["avatar"]["train"]["seen"]["images"] == 4
+
+
+def test_held_out_cameras_are_those_of_the_run(fitted_run, private_cache, tmp_path):
+    """A run that held another camera out is not judged by the capture's own list."""
+    shutil.copytree(fitted_run, tmp_path / "run")
+    settings = tmp_path / "run/settings.yaml"
+    settings.write_text(settings.read_text().replace("held_out_cameras: []", "held_out_cameras: [left, back]"))
+    assert main([str(tmp_path / "run"), "--frames", "1"]) == 0
+    images = {cameras: values["images"] for cameras, values in load_metrics(tmp_path / "run/metrics.json")["avatar"]["test"].items()}
+    assert images == {"seen": 3, "held_out": 2}
+
+
+def forget_checkpoints(run):
+    shutil.rmtree(run / "checkpoints")
+
+
+def lose_capture(run):
+    facts = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(facts | {"capture": str(run / "gone")}))
+
+
+@pytest.mark.parametrize(
+    ("damage", "words", "message"),
+    [
+        (lambda run: (run / "rig.npz").unlink(), [], "expected a run with rig.npz in"),
+        (forget_checkpoints, [], "no checkpoint in"),
+        (lose_capture, [], "/gone; got none"),
+        (lambda run: None, ["--frames", "-1"], "expected --frames of at least 1"),
+        (lambda run: None, ["--checkpoint", "newest"], "expected checkpoint 'best' or 'last'; got 'newest'"),
+        (lambda run: None, ["--output", "/dev/null/metrics.json"], "got /dev/null, which is a file"),
+        (lambda run: None, ["--variant", "scalar_rgb"], "scalar_rgb"),
+    ],
+)
+def test_bad_input_is_one_line(fitted_run, private_cache, tmp_path, capsys, damage, words, message):
+    shutil.copytree(fitted_run, tmp_path / "run")
+    damage(tmp_path / "run")
+    assert main([str(tmp_path / "run"), *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("evaluate: ") and message in line
+
+
+def test_another_face_signal_is_refused(fitted_run, drawn_capture, private_cache, tmp_path, capsys):
+    shutil.copytree(drawn_capture.path, tmp_path / "copy")
+    np.save(tmp_path / "copy/face.npy", np.zeros((len(drawn_capture.frames), 5), np.float32))
+    assert main([str(fitted_run), "--capture", str(tmp_path / "copy"), "--output", str(tmp_path / "metrics.json")]) == 2
+    assert "expected a face signal of 3 numbers" in capsys.readouterr().err and not (tmp_path / "metrics.json").exists()
