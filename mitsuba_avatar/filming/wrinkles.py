@@ -20,7 +20,7 @@ BEND_OF_FULL_FOLD = 0.3  # radians at which a fold is about as high as it gets
 LAG = 0.9  # seconds that cloth needs to follow a bend
 SHARE_OF_LAG = 0.25  # part of the bend that is seen late
 RISE, FALL = 0.4, 2.0  # seconds in which the shirt rides up and comes down
-LARGEST_RIDE = 0.012  # metres that the shirt's hem rides up
+LARGEST_RIDE = 0.005  # metres that the shirt's hem rides up
 SMALLEST_GAP = 0.002  # metres kept between cloth and skin
 LEFT, FRONT, UP = np.eye(3) * [1, -1, 1]  # of the person, rest world axes
 

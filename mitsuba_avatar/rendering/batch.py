@@ -57,3 +57,8 @@ class SurfaceBatch:
     def num_pixels(self) -> int:
         """Pixels of all views together."""
         return self.num_views * self.film[0] * self.film[1]
+
+    @property
+    def num_texels(self) -> int:
+        """Texels of all textures together."""
+        return self.num_views * self.texture_size[0] * self.texture_size[1]

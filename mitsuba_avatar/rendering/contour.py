@@ -1,17 +1,23 @@
-"""Silhouettes: the part of the derivative that comes from contour edges sweeping over pixels.
+"""Silhouettes: the part of the derivative that comes from edges sweeping over pixels.
 
 A pixel is the integral of radiance over its square. Where an edge separates foreground radiance L_f from what lies behind, L_b, moving
-the edge by v pixels along its outward normal n changes the integral by the line integral of (L_f - L_b) n . v. Contour edges are those
-between a front and a back face, and open edges. On each, k stratified positions are evaluated with one ray just outside the edge: a
-nearer hit means the edge is hidden there; otherwise the hit's radiance is L_b (zero for a miss, since images are premultiplied).
+the edge by v pixels along its outward normal n changes the integral by the line integral of (L_f - L_b) n . v. Such edges are contours,
+between a front and a back face; open edges; and seams of the atlas between two front faces, where the texture may jump. On each, k
+stratified positions are evaluated with one ray just outside the edge: a nearer hit means the edge is hidden there; otherwise the hit's
+radiance is L_b (zero for a miss, since images are premultiplied).
+
+Not covered: curves where one part of the surface pierces another. They have no edge; radiance that jumps across them has a biased
+derivative, the mask has not.
 
 Reference: Li et al., "Differentiable Monte Carlo Ray Tracing through Edge Sampling", SIGGRAPH Asia 2018; here edges are enumerated, not
 importance-sampled.
 """
 
+from dataclasses import dataclass
+
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch
-from mitsuba_avatar.rendering.shading import interpolated_uv
+from mitsuba_avatar.rendering.shading import AdjointImage, interpolated_uv
 from mitsuba_avatar.rendering.surface_tables import NO_FACE
 from mitsuba_avatar.rendering.texture_lookup import Footprint
 from mitsuba_avatar.rendering.views import NEAR, View
@@ -42,43 +48,82 @@ def face_planes(batch: SurfaceBatch):
     return planes
 
 
-def contour_edges(batch: SurfaceBatch, planes):
-    """Lanes (view * E + edge) that are contours, and per lane whether the edge's first face is front-facing."""
+def convex_edges(batch: SurfaceBatch, planes):
+    """Bool [P * E]: the second face lies behind the first one's plane. Where a contour edge is concave, the back face lies in front of the
+    front face: the edge hides itself, from every view.
+    """
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    tables = batch.tables
+    lane = dr.arange(mi.UInt32, batch.scene.num_meshes * tables.num_edges)
+    mesh = lane // tables.num_edges
+    edge = lane - mesh * tables.num_edges
+    first_face = dr.gather(mi.Vector4u, tables.edges, edge).z
+    opposite = _vertex(batch.vertices, mesh * batch.num_vertices + dr.gather(mi.UInt32, tables.edge_opposite, edge))
+    is_convex = _height(dr.gather(mi.Vector4f, planes, mesh * tables.num_faces + first_face), opposite) < 0
+    dr.eval(is_convex)
+    return is_convex
+
+
+def contour_edges(batch: SurfaceBatch, planes) -> tuple:
+    """Lanes (view * E + edge) across which radiance may jump; per lane, whether the first face is front-facing, and whether both are."""
     import drjit as dr
 
     mi = loaded_mitsuba()
     tables = batch.tables
     lane = dr.arange(mi.UInt32, batch.num_views * tables.num_edges)
     view = lane // tables.num_edges
-    edge = dr.gather(mi.Vector4u, tables.edges, lane - view * tables.num_edges)
+    edge_index = lane - view * tables.num_edges
+    edge = dr.gather(mi.Vector4u, tables.edges, edge_index)
     center = dr.gather(mi.Vector4f, batch.centers, view)
-    base = mi.UInt32(center.w) * tables.num_faces
+    mesh = mi.UInt32(center.w)
+    base = mesh * tables.num_faces
     is_open = edge.w == NO_FACE
     first = dr.gather(mi.Vector4f, planes, base + edge.z)
     second = dr.gather(mi.Vector4f, planes, base + edge.w, ~is_open)
-    is_front = _height(first, center) > 0
-    is_contour = is_open | (is_front != (_height(second, center) > 0))
-    dr.eval(is_contour, is_front)
-    kept = dr.compress(is_contour)
-    return kept, dr.gather(mi.Bool, is_front, kept)
+    is_front, is_second_front = _height(first, center) > 0, ~is_open & (_height(second, center) > 0)
+    is_front_seam = is_front & is_second_front & (edge_index < tables.num_seams)
+    is_convex = dr.gather(mi.Bool, convex_edges(batch, planes), mesh * tables.num_edges + edge_index)
+    is_boundary = is_open | (is_convex & (is_front != is_second_front)) | is_front_seam
+    dr.eval(is_boundary, is_front, is_front_seam)
+    kept = dr.compress(is_boundary)
+    return kept, dr.gather(mi.Bool, is_front, kept), dr.gather(mi.Bool, is_front_seam, kept)
 
 
-def scatter_contour_adjoint(batch: SurfaceBatch, planes, contour: tuple, samples_per_edge: int, adjoint_image, vertex_gradient) -> None:
-    """Add the silhouettes' share to the gradient of the vertices.
+@dataclass(frozen=True)
+class ContourSamples:
+    """Positions on contour edges, one per lane, and what the image gains there where the edge moves outwards by a pixel.
 
-    Args:
-        batch: what the forward pass rendered.
-        planes: packets of `face_planes`.
-        contour: (lanes, is_front) of `contour_edges`.
-        adjoint_image: packets [B * H * W, 4], derivative of the loss by radiance and mask of each pixel.
-        vertex_gradient: packets [P * V, 4], accumulated in place.
+    Attributes:
+        pixel, view_index: where in the image; active: whether the edge is seen there at all.
+        vertices: packet indices of the edge's two ends; points: the ends in camera axes; shares: how much each end moves the position.
+        outward: unit normal in pixels; weight: pixels of edge that the sample stands for.
+        radiance, mask: foreground minus background.
     """
+
+    view: View
+    view_index: object
+    pixel: object
+    active: object
+    vertices: tuple
+    points: tuple
+    shares: tuple
+    outward: object
+    weight: object
+    radiance: object
+    mask: object
+
+
+def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSamples | None:
+    """Stratified samples on all contour edges of all views; None where there are none."""
     import drjit as dr
 
     mi = loaded_mitsuba()
-    tables, table, vertices, textures = batch.tables, batch.views, batch.vertices, batch.textures
-    texture_size, num_vertices = batch.texture_size, batch.num_vertices
-    kept, front = contour
+    tables = batch.tables
+    kept, front, front_seam = contour_edges(batch, face_planes(batch))
+    if len(kept) == 0:
+        return None
     width, height = batch.film
     lane = dr.arange(mi.UInt32, len(kept) * samples_per_edge)
     row = lane // samples_per_edge
@@ -87,59 +132,109 @@ def scatter_contour_adjoint(batch: SurfaceBatch, planes, contour: tuple, samples
     edge_index = packed - view_index * tables.num_edges
     edge = dr.gather(mi.Vector4u, tables.edges, edge_index)
     is_front = dr.gather(mi.Bool, front, row)
-    is_open = edge.w == NO_FACE
-    view = View.gather(table, view_index)
-    base = view.mesh * num_vertices
-
-    # ---- Which side is foreground: the front face, or the only one ----
-    from_first = is_front | is_open
-    foreground_side = dr.select(from_first, mi.UInt32(0), mi.UInt32(1))
-    first_plane = dr.gather(mi.Vector4f, planes, view.mesh * tables.num_faces + edge.z)
-    opposite = _vertex(vertices, base + dr.gather(mi.UInt32, tables.edge_opposite, edge_index))
-    # At a concave contour edge the back face lies in front of the front face: the edge hides itself.
-    is_convex = dr.dot(mi.Vector3f(first_plane.x, first_plane.y, first_plane.z), opposite) < first_plane.w
+    view = View.gather(batch.views, view_index)
 
     # ---- Position on the edge, stratified in screen space ----
-    index_a, index_b = base + edge.x, base + edge.y
-    point_a, point_b = (view.to_camera(_vertex(vertices, i)) for i in (index_a, index_b))
+    base = view.mesh * batch.num_vertices
+    ends = (base + edge.x, base + edge.y)
+    point_a, point_b = (view.to_camera(_vertex(batch.vertices, end)) for end in ends)
     pixel_a, pixel_b = view.project(point_a), view.project(point_b)
     random, _ = mi.sample_tea_32(packed, batch.seed_gradient, TEA_ROUNDS)
-    offset = mi.Float(lane - row * samples_per_edge) + mi.Float(random) * 2.0**-32
-    along = offset * (1.0 / samples_per_edge)
+    along = (mi.Float(lane - row * samples_per_edge) + mi.Float(random) * 2.0**-32) * (1.0 / samples_per_edge)
     step = pixel_b - pixel_a
     length = dr.norm(step)
     position = pixel_a + step * along
-    active = (is_open | is_convex) & (point_a.z > NEAR) & (point_b.z > NEAR) & (length > 1e-6)
+    active = (point_a.z > NEAR) & (point_b.z > NEAR) & (length > 1e-6)
     active &= (position.x >= 0) & (position.x < width) & (position.y >= 0) & (position.y < height)
     # The first face winds a -> b; seen from its front, its inside is at (dy, -dx) in pixels with y down. The foreground face is seen
     # from the front, unless it is an open back face; the second face winds the other way.
     outward = mi.Point2f(-step.y, step.x) * dr.rcp(dr.maximum(length, 1e-6))
     outward = dr.select(is_front, outward, -outward)
 
-    # ---- Radiance on both sides ----
     weight_b = along * point_a.z
     weight_b = weight_b / (weight_b + (1.0 - along) * point_b.z)  # perspective: from the screen to the edge itself
+    is_open = edge.w == NO_FACE
+    side = dr.select(is_front | is_open, mi.UInt32(0), mi.UInt32(1))  # of the foreground: the front face, or the only one
+    foreground = _edge_radiance(batch, view_index, edge_index * 2 + side, weight_b, active)
+    second_face = dr.select(dr.gather(mi.Bool, front_seam, row), edge.w, NO_FACE)
+    ray_position = position + outward * (OUTSIDE * max(width, height))
     depth = dr.lerp(point_a.z, point_b.z, weight_b)
-    ends = dr.gather(mi.Vector4f, tables.edge_uv, edge_index * 2 + foreground_side)
-    foreground_uv = dr.lerp(mi.Point2f(ends.x, ends.y), mi.Point2f(ends.z, ends.w), weight_b)
-    foreground = Footprint.at(foreground_uv, view_index, *texture_size).value(textures, active)
+    background, is_hit, active = _background(batch, view, view_index, ray_position, depth, second_face, active)
+    return ContourSamples(
+        view=view,
+        view_index=view_index,
+        pixel=(view_index * height + mi.UInt32(position.y)) * width + mi.UInt32(position.x),
+        active=active,
+        vertices=ends,
+        points=(point_a, point_b),
+        shares=(1.0 - along, along),
+        outward=outward,
+        weight=length * (1.0 / samples_per_edge),
+        radiance=foreground - background,
+        mask=dr.select(is_hit, mi.Float(0.0), mi.Float(1.0)),
+    )
+
+
+def scatter_contour_adjoint(samples: ContourSamples, adjoint_image: AdjointImage, vertex_gradient) -> None:
+    """Add the silhouettes' share to the gradient of the vertices, packets [P * V, 4]."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    radiance, mask = adjoint_image.at(samples.pixel, samples.view_index, samples.active)
+    gradient = samples.outward * ((dr.dot(radiance, samples.radiance) + mask * samples.mask) * samples.weight)
+    for index, point, share in zip(samples.vertices, samples.points, samples.shares, strict=True):
+        moved = samples.view.project_adjoint(point, gradient * share)
+        dr.scatter_add(vertex_gradient, mi.Vector4f(moved.x, moved.y, moved.z, 0.0), index, samples.active)
+
+
+def scatter_contour_derivative(samples: ContourSamples, motion, radiance, mask) -> None:
+    """Add the silhouettes' share to the derivative of the image along a motion of the vertices.
+
+    Args:
+        motion: packets [P * V, 4], metres a unit.
+        radiance, mask: packets [B * H * W, 4] and flat [B * H * W], accumulated in place.
+    """
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    speed = mi.Float(0.0)
+    for index, point, share in zip(samples.vertices, samples.points, samples.shares, strict=True):
+        speed += share * dr.dot(samples.outward, samples.view.project_derivative(point, _vertex(motion, index)))
+    swept = speed * samples.weight
+    gain = samples.radiance * swept
+    dr.scatter_add(radiance, mi.Vector4f(gain.x, gain.y, gain.z, 0.0), samples.pixel, samples.active)
+    dr.scatter_add(mask, samples.mask * swept, samples.pixel, samples.active)
+
+
+def _edge_radiance(batch: SurfaceBatch, view_index, row, weight_b, active):
+    """Radiance (Color3f) of the surface at an edge, from row `row` of the edges' texture coordinates."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    ends = dr.gather(mi.Vector4f, batch.tables.edge_uv, row)
+    uv = dr.lerp(mi.Point2f(ends.x, ends.y), mi.Point2f(ends.z, ends.w), weight_b)
+    return Footprint.at(uv, view_index, *batch.texture_size).value(batch.textures, active)
+
+
+def _background(batch: SurfaceBatch, view: View, view_index, position, depth, second_face, active) -> tuple:
+    """What a ray just outside an edge meets: radiance (0 for a miss), whether it hits, and whether the edge is in sight there.
+
+    Beyond a seam lies its second face, or the seam is hidden; beyond a contour (second_face NO_FACE) anything but a nearer surface may.
+    """
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    tables = batch.tables
     limit = dr.gather(mi.Float, batch.boxes.depth_limit, view_index)
-    found = batch.scene.scene.ray_intersect_preliminary(view.ray(position + outward * (OUTSIDE * max(width, height)), limit), coherent=False, active=active)
+    found = batch.scene.scene.ray_intersect_preliminary(view.ray(position, limit), coherent=False, active=active)
     face = found.prim_index - view.mesh * tables.num_faces
     is_hit = active & found.is_valid() & (face < tables.num_faces)
     face = dr.select(is_hit, face, 0)
-    active &= ~(is_hit & (found.t < depth * (1.0 - DEPTH_TOLERANCE)))
-    behind = Footprint.at(interpolated_uv(tables, face, found.prim_uv), view_index, *texture_size).value(textures, is_hit & active)
-    is_background = dr.select(is_hit, mi.Float(0.0), mi.Float(1.0))
-
-    # ---- Push the adjoint through the line integral to the edge's ends ----
-    pixel = (view_index * height + mi.UInt32(position.y)) * width + mi.UInt32(position.x)
-    adjoint = dr.gather(mi.Vector4f, adjoint_image, pixel, active)
-    jump = dr.dot(mi.Color3f(adjoint.x, adjoint.y, adjoint.z), foreground - dr.select(is_hit, behind, 0.0)) + adjoint.w * is_background
-    gradient = outward * (jump * length * (1.0 / samples_per_edge))
-    for index, point, share in ((index_a, point_a, 1.0 - along), (index_b, point_b, along)):
-        moved = view.project_adjoint(point, gradient * share)
-        dr.scatter_add(vertex_gradient, mi.Vector4f(moved.x, moved.y, moved.z, 0.0), index, active)
+    is_nearer = is_hit & (found.t < depth * (1.0 - DEPTH_TOLERANCE))
+    active = active & dr.select(second_face == NO_FACE, ~is_nearer, is_hit & (face == second_face))
+    uv = interpolated_uv(tables, face, found.prim_uv)
+    radiance = Footprint.at(uv, view_index, *batch.texture_size).value(batch.textures, is_hit & active)
+    return dr.select(is_hit, radiance, 0.0), is_hit, active
 
 
 def _vertex(vertices, index):

@@ -52,7 +52,7 @@ class MeshScene:
         )
         self.version = 0  # counts updates, so that a late backward pass can tell whether the meshes are still its own
         self.parameters = mi.traverse(self.scene)
-        (self.positions_key,) = [key for key in self.parameters.keys() if key.endswith("vertex_positions")]
+        (self.positions_key,) = [key for key in self.parameters.keys() if key.endswith("vertex_positions")]  # noqa: SIM118 (iteration gives pairs)
 
     def update(self, positions) -> None:
         """Move the merged mesh: positions is an mi.Float of P * V * 3 metres in scene coordinates. Rebuilds the ray-tracing hierarchy."""

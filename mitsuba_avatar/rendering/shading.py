@@ -5,9 +5,11 @@ last two vertices: moving the face by q at the hit point changes the weights so 
 
     db1 = -q . (e2 x d) / D,   db2 = -q . (d x e1) / D,   D = e1 . (e2 x d).
 
-With L(u(b1, b2)) the texture at the hit, the adjoint of the loss reaches q, and from there each vertex by its weight. Silhouettes are
-not covered by this: `contour` has their share.
+With L(u(b1, b2)) the texture at the hit, the adjoint of the loss reaches q, and from there each vertex by its weight; the derivative along a
+motion of the vertices runs the other way. Silhouettes are not covered by this: `contour` has their share.
 """
+
+from dataclasses import dataclass
 
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch
@@ -15,6 +17,18 @@ from mitsuba_avatar.rendering.surface_tables import SurfaceTables
 from mitsuba_avatar.rendering.texture_lookup import Footprint
 from mitsuba_avatar.rendering.views import View
 from mitsuba_avatar.rendering.visibility import Hits
+
+
+def face_corners(batch: SurfaceBatch, view: View, face) -> tuple:
+    """Packet indices of a face's three vertices in the mesh of its view, and their local positions (Vector3f)."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    corners = dr.gather(mi.Vector4u, batch.tables.faces, face)
+    base = view.mesh * batch.num_vertices
+    index = (base + corners.x, base + corners.y, base + corners.z)
+    packets = (dr.gather(mi.Vector4f, batch.vertices, i) for i in index)
+    return index, tuple(mi.Vector3f(packet.x, packet.y, packet.z) for packet in packets)
 
 
 def corner_uv(tables: SurfaceTables, face):
@@ -39,50 +53,65 @@ def shade(batch: SurfaceBatch, hits: Hits):
     return Footprint.at(uv, hits.view, *batch.texture_size).value(batch.textures)
 
 
-def scatter_image(batch: SurfaceBatch, hits: Hits, radiance):
-    """Image packets [B * H * W, 4]: radiance premultiplied by coverage, and the coverage (mask)."""
+def scatter_image(batch: SurfaceBatch, hits: Hits, radiance, image, mask) -> None:
+    """Add to image [B, 3, H, W] the radiance premultiplied by coverage, and to mask [B, H, W] the coverage; both flat."""
     import drjit as dr
 
     mi = loaded_mitsuba()
-    image = dr.zeros(mi.Float, batch.num_pixels * 4)
-    packet = mi.Vector4f(radiance.x, radiance.y, radiance.z, 1.0)
-    if batch.samples_per_pixel == 1:  # no two lanes share a pixel
-        dr.scatter(image, packet, hits.pixel)
-    else:
-        dr.scatter_add(image, packet * (1.0 / batch.samples_per_pixel), hits.pixel)
-    return image
+    plane = batch.film[0] * batch.film[1]
+    first = hits.pixel + hits.view * (2 * plane)
+    targets = [(image, first + channel * plane, radiance[channel]) for channel in range(3)]
+    for target, index, value in (*targets, (mask, hits.pixel, mi.Float(1.0))):
+        if batch.samples_per_pixel == 1:  # no two lanes share a pixel
+            dr.scatter(target, value, index)
+        else:
+            dr.scatter_add(target, value * (1.0 / batch.samples_per_pixel), index)
 
 
-def scatter_shading_adjoint(batch: SurfaceBatch, hits: Hits, adjoint_image, vertex_gradient, texture_gradient) -> None:
-    """Add the interior's share to the gradients of vertices and textures.
+@dataclass(frozen=True)
+class AdjointImage:
+    """Derivative of the loss by radiance [B, 3, H, W] and mask [B, H, W], both flat, as the backward pass receives them."""
 
-    Args:
-        adjoint_image: packets [B * H * W, 4]; the mask's entry has no interior derivative.
-        vertex_gradient, texture_gradient: packets [P * V, 4] and [B * h * w, 4], accumulated in place; None where not wanted.
+    radiance: object
+    mask: object
+    plane: int  # pixels of one view
+
+    def at(self, pixel, view, active=True) -> tuple:
+        """The entries of a pixel (index into B * H * W) of a view: Color3f and Float."""
+        import drjit as dr
+
+        mi = loaded_mitsuba()
+        first = pixel + view * (2 * self.plane)
+        channels = [dr.gather(mi.Float, self.radiance, first + channel * self.plane, active) for channel in range(3)]
+        return mi.Color3f(*channels), dr.gather(mi.Float, self.mask, pixel, active)
+
+
+@dataclass(frozen=True)
+class HitDerivatives:
+    """How a hit's radiance follows the surface that moves under its ray.
+
+    Attributes:
+        vertices: packet indices of the face's corners; weights: barycentric.
+        footprint: of the texture lookup.
+        slope_u, slope_v: Vector3f, derivatives of u and v by the motion of the hit point, in world axes.
     """
+
+    vertices: tuple
+    weights: tuple
+    footprint: Footprint
+    slope_u: object
+    slope_v: object
+
+
+def hit_derivatives(batch: SurfaceBatch, hits: Hits) -> HitDerivatives:
+    """See the module for the equations."""
     import drjit as dr
 
-    mi = loaded_mitsuba()
-    height, width = batch.texture_size
     view = View.gather(batch.views, hits.view)
-    packet = dr.gather(mi.Vector4f, adjoint_image, hits.pixel) * (1.0 / batch.samples_per_pixel)
-    adjoint = mi.Color3f(packet.x, packet.y, packet.z)
-    uv0, uv1, uv2 = corner_uv(batch.tables, hits.face)
     b1, b2 = hits.barycentric.x, hits.barycentric.y
-    footprint = Footprint.at(uv0 + (uv1 - uv0) * b1 + (uv2 - uv0) * b2, hits.view, height, width)
-    if texture_gradient is not None:
-        footprint.scatter_adjoint(texture_gradient, adjoint)
-    if vertex_gradient is None:
-        return
-    along_u, along_v = footprint.derivative(batch.textures, height, width)
-    gradient_u, gradient_v = dr.dot(adjoint, along_u), dr.dot(adjoint, along_v)
-    gradient_b1 = gradient_u * (uv1.x - uv0.x) + gradient_v * (uv1.y - uv0.y)
-    gradient_b2 = gradient_u * (uv2.x - uv0.x) + gradient_v * (uv2.y - uv0.y)
-
-    corners = dr.gather(mi.Vector4u, batch.tables.faces, hits.face)
-    base = view.mesh * batch.num_vertices
-    index = (base + corners.x, base + corners.y, base + corners.z)
-    v0, v1, v2 = (mi.Vector3f(p.x, p.y, p.z) for p in (dr.gather(mi.Vector4f, batch.vertices, i) for i in index))
+    uv0, uv1, uv2 = corner_uv(batch.tables, hits.face)
+    uv_e1, uv_e2 = uv1 - uv0, uv2 - uv0
+    index, (v0, v1, v2) = face_corners(batch, view, hits.face)
     e1, e2 = v1 - v0, v2 - v0
     # The ray's direction from the hit itself, scaled to unit depth: no random numbers need repeating.
     hit = view.to_camera(v0 + e1 * b1 + e2 * b2)
@@ -91,6 +120,49 @@ def scatter_shading_adjoint(batch: SurfaceBatch, hits: Hits, adjoint_image, vert
     volume = dr.dot(e1, across_e2)
     # A face seen exactly edge-on covers no area: it has no interior derivative.
     inverse = dr.select(dr.abs(volume) > 1e-20, dr.rcp(volume), 0.0)
-    moved = -(gradient_b1 * across_e2 + gradient_b2 * across_e1) * inverse
-    for i, weight in zip(index, (1.0 - b1 - b2, b1, b2), strict=True):
-        dr.scatter_add(vertex_gradient, mi.Vector4f(moved.x * weight, moved.y * weight, moved.z * weight, 0.0), i)
+    slope_u = (across_e2 * uv_e1.x + across_e1 * uv_e2.x) * -inverse
+    slope_v = (across_e2 * uv_e1.y + across_e1 * uv_e2.y) * -inverse
+    footprint = Footprint.at(uv0 + uv_e1 * b1 + uv_e2 * b2, hits.view, *batch.texture_size)
+    return HitDerivatives(index, (1.0 - b1 - b2, b1, b2), footprint, slope_u, slope_v)
+
+
+def scatter_shading_adjoint(batch: SurfaceBatch, hits: Hits, adjoint_image: AdjointImage, vertex_gradient, texture_gradient) -> None:
+    """Add the interior's share to the gradients of vertices and textures.
+
+    Args:
+        adjoint_image: derivative of the loss; the mask has none in the interior.
+        vertex_gradient, texture_gradient: packets [P * V, 4] and [B * h * w, 4], accumulated in place; None where not wanted.
+    """
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    adjoint = adjoint_image.at(hits.pixel, hits.view)[0] * (1.0 / batch.samples_per_pixel)
+    hit = hit_derivatives(batch, hits)
+    if texture_gradient is not None:
+        hit.footprint.scatter_adjoint(texture_gradient, adjoint)
+    if vertex_gradient is None:
+        return
+    along_u, along_v = hit.footprint.derivative(batch.textures, *batch.texture_size)
+    moved = hit.slope_u * dr.dot(adjoint, along_u) + hit.slope_v * dr.dot(adjoint, along_v)
+    for index, weight in zip(hit.vertices, hit.weights, strict=True):
+        dr.scatter_add(vertex_gradient, mi.Vector4f(moved.x * weight, moved.y * weight, moved.z * weight, 0.0), index)
+
+
+def scatter_shading_derivative(batch: SurfaceBatch, hits: Hits, motion, radiance) -> None:
+    """Add the interior's share to the derivative of the image along a motion of the vertices.
+
+    Args:
+        motion: packets [P * V, 4], metres a unit.
+        radiance: packets [B * H * W, 4], accumulated in place.
+    """
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    hit = hit_derivatives(batch, hits)
+    moved = mi.Vector3f(0.0)
+    for index, weight in zip(hit.vertices, hit.weights, strict=True):
+        packet = dr.gather(mi.Vector4f, motion, index)
+        moved += mi.Vector3f(packet.x, packet.y, packet.z) * weight
+    along_u, along_v = hit.footprint.derivative(batch.textures, *batch.texture_size)
+    gain = (along_u * dr.dot(hit.slope_u, moved) + along_v * dr.dot(hit.slope_v, moved)) * (1.0 / batch.samples_per_pixel)
+    dr.scatter_add(radiance, mi.Vector4f(gain.x, gain.y, gain.z, 0.0), hits.pixel)

@@ -18,6 +18,8 @@ class SurfaceTables:
         faces: [F, 4] vertices of a face, last entry unused.
         face_uv: [F, 8] u0 v0 u1 v1 u2 v2, last two unused.
         edges: [E, 4] vertices a, b in the order of the first face's winding | first face | second face (NO_FACE where the mesh is open).
+            Seams, where the two faces give their edge different texture coordinates, come first.
+        num_seams: how many they are.
         edge_opposite: [E] vertex of the second face that is not on the edge (of the first face where the mesh is open).
         edge_uv: [E, 8] coordinates of a and b as corners of the first face, then of the second.
     """
@@ -27,7 +29,10 @@ class SurfaceTables:
         self.num_faces = len(faces)
         face_uv = uv[uv_faces].reshape(-1, 6).astype(np.float32)
         edges, opposite, edge_uv = edge_tables(faces, uv[uv_faces])
-        self.num_edges = len(edges)
+        is_seam = (edge_uv[:, :4] != edge_uv[:, 4:]).any(axis=1)
+        order = np.argsort(~is_seam, kind="stable")
+        edges, opposite, edge_uv = edges[order], opposite[order], edge_uv[order]
+        self.num_edges, self.num_seams = len(edges), int(is_seam.sum())
         self.faces = mi.UInt32(np.pad(faces, ((0, 0), (0, 1))).astype(np.uint32).ravel())
         self.face_uv = mi.Float(np.pad(face_uv, ((0, 0), (0, 2))).ravel())
         self.edges = mi.UInt32(edges.astype(np.uint32).ravel())

@@ -69,3 +69,34 @@ class Footprint:
         for index, weight in zip(self.index, weights, strict=True):
             packet = mi.Vector4f(adjoint.x * weight, adjoint.y * weight, adjoint.z * weight, 0.0)
             dr.scatter_add(gradient, packet, index, active)
+
+
+def texel_packets(textures):
+    """Textures [B, 3, h, w] as packets [B * h * w, 4] of red, green, blue, 0: a texel is one 16-byte read, and one atomic add."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    count, _, height, width = textures.shape
+    size = height * width
+    lane = dr.arange(mi.UInt32, count * size)
+    first = lane + lane // size * (2 * size)
+    red, green, blue = (dr.gather(mi.Float, textures.array, first + channel * size) for channel in range(3))
+    packets = dr.empty(mi.Float, count * size * 4)
+    dr.scatter(packets, mi.Vector4f(red, green, blue, 0.0), lane)
+    return packets
+
+
+def planar_texels(packets, shape: tuple[int, int, int, int]):
+    """The inverse of `texel_packets`, flat."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    count, _, height, width = shape
+    size = height * width
+    lane = dr.arange(mi.UInt32, count * size)
+    first = lane + lane // size * (2 * size)
+    packet = dr.gather(mi.Vector4f, packets, lane)
+    flat = dr.empty(mi.Float, count * size * 3)
+    for channel in range(3):
+        dr.scatter(flat, packet[channel], first + channel * size)
+    return flat

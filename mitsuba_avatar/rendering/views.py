@@ -116,6 +116,18 @@ class View:
             self.focal[1] * point_camera.y * inverse_depth + self.principal[1],
         )
 
+    def project_derivative(self, point_camera, motion):
+        """How fast a point's pixel position (Point2f) moves where the point moves by `motion` (world axes)."""
+        import drjit as dr
+
+        mi = loaded_mitsuba()
+        r = self.rotation
+        x, y, z = (r[3 * i] * motion.x + r[3 * i + 1] * motion.y + r[3 * i + 2] * motion.z for i in range(3))
+        inverse_depth = dr.rcp(dr.maximum(point_camera.z, NEAR))
+        along_x = (x - point_camera.x * z * inverse_depth) * inverse_depth
+        along_y = (y - point_camera.y * z * inverse_depth) * inverse_depth
+        return mi.Point2f(self.focal[0] * along_x, self.focal[1] * along_y)
+
     def project_adjoint(self, point_camera, gradient_pixel):
         """Gradient with respect to a point from the gradient with respect to its pixel position."""
         import drjit as dr

@@ -1,0 +1,18 @@
+"""The rigs that the renderer's tests share."""
+
+import pytest
+
+from tests.small_rig import make_small_rig
+
+
+@pytest.fixture(scope="session")
+def small_rig():
+    return make_small_rig()
+
+
+@pytest.fixture(scope="session")
+def anny_rig():
+    """The default person; built once into the cache folder (a minute where Anny has never run)."""
+    from mitsuba_avatar.body.anny_rig import build_anny_rig
+
+    return build_anny_rig()
