@@ -15,10 +15,10 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 
 from mitsuba_avatar.captures.cameras import Camera, look_at  # noqa: E402
+from mitsuba_avatar.captures.colour import encode  # noqa: E402
 from mitsuba_avatar.loaded_run import LoadedRun  # noqa: E402
 from mitsuba_avatar.rendering.cameras import CameraBatch  # noqa: E402
 from mitsuba_avatar.reporting.figures import save_image  # noqa: E402
-from mitsuba_avatar.reporting.presentation import on_backdrop  # noqa: E402
 
 WIDTH, HEIGHT = 240, 400
 
@@ -39,6 +39,7 @@ for bend in (0.0, 0.5, 1.0):  # radians
         open_share = occlusion.bake(avatar.pose_template(theta, root)[0])[None, None]
         output = avatar.decode(theta, root, face, None, cameras.centers[None], open_share)
         radiance, mask = renderer.render(output.vertices, output.textures[0], cameras)
+        picture = encode(radiance + 0.18 * (1 - mask), "srgb").clamp(0, 1)  # over a grey backdrop
     path = run / "examples" / f"elbows_{bend:.1f}.png"
-    save_image(path, on_backdrop(radiance[0].permute(1, 2, 0).numpy(), mask[0, 0].numpy()))
+    save_image(path, picture[0].permute(1, 2, 0).numpy())
     print(path)  # noqa: T201

@@ -26,7 +26,7 @@ from mitsuba_avatar.reporting.camera_paths import orbit
 from mitsuba_avatar.reporting.evaluation import Evaluator
 from mitsuba_avatar.reporting.figures import loss_curves, save_image
 from mitsuba_avatar.reporting.metrics import read_records
-from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, on_backdrop, posed_corners
+from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, posed_corners
 from mitsuba_avatar.reporting.tables import terminal_table
 from mitsuba_avatar.reporting.video import write_video
 from mitsuba_avatar.settings import Settings, StudioSettings
@@ -214,9 +214,9 @@ class Fit:
             drawn = draw_along(self.avatar, capture, along, cameras, renderer, self.occlusion.occlusion)
 
             def pictures() -> Iterator:
-                for done, (radiance, mask) in enumerate(drawn):
+                for done, picture in enumerate(drawn):
                     bar.update(done + 1)
-                    yield on_backdrop(radiance, mask)
+                    yield picture.on_backdrop()
 
             write_video(self.run.path / "orbit.mp4", pictures(), fps=12.0)
 

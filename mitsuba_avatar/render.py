@@ -1,7 +1,7 @@
-"""Render a fitted avatar: `python -m mitsuba_avatar.render RUN [--path orbit|held_out] [--format png|exr|mp4]`.
+"""Render a fitted avatar: `python -m mitsuba_avatar.render RUN [--path orbit|held_out] [--format png|exr|mp4|ply]`.
 
 The avatar is driven by a capture (by default the one it was trained on), with a zero latent code. EXR files hold linear radiance,
-mask and the standard layer names; PNG and MP4 show it over a grey backdrop, sRGB-encoded.
+mask, depth, normal, position and uv under the standard layer names; PNG and MP4 show it over a grey backdrop, sRGB-encoded.
 """
 
 import sys
@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mitsuba_avatar.files import check_writable
+from mitsuba_avatar.files import atomic_path, check_writable
 from mitsuba_avatar.rendering import backend
 
 
@@ -21,7 +21,7 @@ class RenderCommand:
 
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
     path: Literal["orbit", "held_out"] = "orbit"  # cameras: a walk around, or the capture's held-out cameras
-    format: Literal["png", "exr", "mp4"] = "png"
+    format: Literal["png", "exr", "mp4", "ply"] = "png"  # ply: the posed mesh, metres, world axes
     split: Literal["test", "train"] = "test"  # frames that drive the avatar
     frames: int = 24  # how many pictures
     width: int = 360  # of an orbit; held-out cameras keep their size
@@ -49,12 +49,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _render(command: RenderCommand) -> Path:
     # Imported after the variant is set, because these modules load torch and Dr.Jit.
+    import trimesh
+
     from mitsuba_avatar.loaded_run import LoadedRun
     from mitsuba_avatar.progress import progress_bar
     from mitsuba_avatar.reporting.camera_paths import orbit
     from mitsuba_avatar.reporting.exr import write_exr
     from mitsuba_avatar.reporting.figures import save_image
-    from mitsuba_avatar.reporting.presentation import Shot, draw_along, on_backdrop, posed_corners
+    from mitsuba_avatar.reporting.presentation import Shot, draw_along, posed_corners
     from mitsuba_avatar.reporting.video import write_video
 
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
@@ -82,14 +84,17 @@ def _render(command: RenderCommand) -> Path:
         drawn = draw_along(loaded.avatar, capture, frames, cameras, renderer, loaded.occlusion())
         if command.format == "mp4":
             output = folder.with_suffix(".mp4")
-            write_video(output, (on_backdrop(*picture) for picture in _counted(drawn, bar)), fps=12.0)
+            write_video(output, (picture.on_backdrop() for picture in _counted(drawn, bar)), fps=12.0)
             return output
-        for shot, (radiance, mask) in zip(shots, _counted(drawn, bar), strict=True):
+        for shot, picture in zip(shots, _counted(drawn, bar), strict=True):
             path = folder / f"{shot.camera}_{capture.frames[shot.frame].number:06d}.{command.format}"
             if command.format == "exr":
-                write_exr(path, {"colour": radiance, "mask": mask})
+                write_exr(path, picture.layers())
+            elif command.format == "ply":
+                with atomic_path(path) as temporary:
+                    trimesh.Trimesh(picture.vertices, loaded.run.rig.topology.faces, process=False).export(temporary)
             else:
-                save_image(path, on_backdrop(radiance, mask))
+                save_image(path, picture.on_backdrop())
     return folder
 
 

@@ -7,6 +7,7 @@ import av
 import numpy as np
 import OpenEXR
 import pytest
+import trimesh
 
 from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.captures.images import read_image
@@ -39,6 +40,14 @@ def test_an_orbit_as_layers(fitted_run, private_cache, tmp_path):
     assert mask.shape == (44, 30) and 0.02 < mask.mean() < 0.6 and mask.max() == pytest.approx(1, abs=1e-3)
     edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
     assert edge.max() == 0, "the whole body is in view"
+
+
+def test_posed_meshes(fitted_run, private_cache, tmp_path):
+    words = ("--format", "ply", "--frames", "2", "--width", "30", "--height", "44", "--split", "train")
+    assert main([str(fitted_run), *words, "--output", str(tmp_path / "out")]) == 0
+    first, second = (trimesh.load(path, process=False) for path in sorted((tmp_path / "out").iterdir()))
+    assert first.vertices.shape == second.vertices.shape == (258, 3) and len(first.faces) > 400
+    assert np.abs(first.vertices - second.vertices).max() > 1e-3
 
 
 def test_an_orbit_as_video(fitted_run, private_cache, tmp_path, capsys):

@@ -123,6 +123,6 @@ class Evaluator:
         return Drawn(nearest.images, nearest.masks, vertices)
 
 
-def as_images(images: Float[Tensor, "B 3 H W"]) -> Float[np.ndarray, "B H W 3"]:
+def as_images(images: Float[Tensor, "B C H W"]) -> Float[np.ndarray, "B H W C"]:
     """Torch's channel order to numpy's, from any device."""
     return images.permute(0, 2, 3, 1).contiguous().cpu().numpy()

@@ -35,6 +35,41 @@ class Shot:
     camera: str
 
 
+@dataclass(frozen=True)
+class Driven:
+    """An avatar in one pose, seen by one camera. Geometry layers are those of the first sample of a pixel, zero where it sees nothing.
+
+    Attributes:
+        vertices: [V, 3] metres, world axes.
+        radiance: [H, W, 3] linear, premultiplied by coverage. mask: [H, W, 1].
+        normal: [H, W, 3] unit, world axes. depth: [H, W, 1] metres along the camera's axis.
+        position: [H, W, 3] metres, world axes. uv: [H, W, 2].
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    radiance: Float[np.ndarray, "H W 3"]
+    mask: Float[np.ndarray, "H W 1"]
+    normal: Float[np.ndarray, "H W 3"]
+    depth: Float[np.ndarray, "H W 1"]
+    position: Float[np.ndarray, "H W 3"]
+    uv: Float[np.ndarray, "H W 2"]
+
+    def on_backdrop(self) -> UInt8[np.ndarray, "H W 3"]:
+        """The picture over a mid-grey backdrop, display-encoded, as bytes."""
+        return to_bytes(np.clip(encode(self.radiance + (1 - self.mask) * np.float32(BACKDROP), "srgb"), 0, 1))
+
+    def layers(self) -> dict[str, Float[np.ndarray, "H W *C"]]:
+        """What a multi-channel EXR holds, by the names of `reporting.exr`."""
+        return {
+            "colour": np.concatenate([self.radiance, self.mask], axis=-1),  # premultiplied, as EXR has it
+            "mask": self.mask[..., 0],
+            "depth": self.depth[..., 0],
+            "normal": self.normal,
+            "position": self.position,
+            "uv": self.uv,
+        }
+
+
 class Presentation:
     """Draws an avatar in training or at its end.
 
@@ -114,8 +149,8 @@ def draw_along(
     cameras: Sequence[Camera],
     renderer: SurfaceRenderer,
     occlusion: AmbientOcclusion,
-) -> Iterator[tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]]:
-    """Drive an avatar with frames of a capture, one camera each, and yield linear radiance (premultiplied) and mask.
+) -> Iterator[Driven]:
+    """Drive an avatar with frames of a capture, one camera each.
 
     Args:
         avatar: to be driven, latent code zero.
@@ -133,8 +168,9 @@ def draw_along(
             template = avatar.pose_template(theta, torch.eye(4, device=device)[None])[0]
             share = occlusion.bake(template.cpu(), seed=index)[None, None]
             output = avatar.decode(theta, root, face, None, batch.centers[None].to(device), share.to(device))
-            radiance, mask = renderer.render(output.vertices, output.textures.flatten(0, 1), batch, seed=index)
-        yield as_images(radiance)[0], mask[0, 0].cpu().numpy()
+            layers = renderer.render_layers(output.vertices, output.textures.flatten(0, 1), batch, seed=index)
+        images = {name: as_images(getattr(layers, name))[0] for name in ("radiance", "mask", "normal", "depth", "position", "uv")}
+        yield Driven(vertices=output.vertices[0].cpu().numpy(), **images)
 
 
 @torch.no_grad()
@@ -160,8 +196,3 @@ def posed_corners(avatar: Avatar, capture: Capture, frames: Sequence[int]) -> Fl
 def _row(values: Float[np.ndarray, "N *shape"], index: int) -> Float[Tensor, "1 *shape"]:
     """One frame of an array, copied out of the file, as a batch of one."""
     return torch.from_numpy(np.array(values[index], np.float32))[None]
-
-
-def on_backdrop(radiance: Float[np.ndarray, "H W 3"], mask: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Linear premultiplied radiance over a mid-grey backdrop, display-encoded, as bytes."""
-    return to_bytes(np.clip(encode(radiance + (1 - mask[..., None]) * np.float32(BACKDROP), "srgb"), 0, 1))
