@@ -1,6 +1,6 @@
 """The renderer alone: move a triangle mesh so that its image matches a target, by gradient descent through Mitsuba.
 
-    python examples/01_gradient_of_an_image.py
+python examples/01_gradient_of_an_image.py
 """
 
 from mitsuba_avatar.rendering.backend import select_variant

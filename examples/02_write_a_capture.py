@@ -1,7 +1,7 @@
 """Write a capture in the neutral layout: here a posed rig, drawn flat into three cameras; yours has photographs instead.
 
-    python examples/02_write_a_capture.py /tmp/my_capture
-    python -m mitsuba_avatar.capture check /tmp/my_capture
+python examples/02_write_a_capture.py /tmp/my_capture
+python -m mitsuba_avatar.capture check /tmp/my_capture
 """
 
 import sys

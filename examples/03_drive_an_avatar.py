@@ -1,7 +1,7 @@
 """Drive a fitted avatar in a few lines: bend its elbows, draw it from the front.
 
-    make fit
-    python examples/03_drive_an_avatar.py runs/default
+make fit
+python examples/03_drive_an_avatar.py runs/default
 """
 
 import sys

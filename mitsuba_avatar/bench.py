@@ -132,7 +132,7 @@ def orbit(views: int, width: int, height: int) -> CameraBatch:
     poses = np.tile(np.eye(4), (views, 1, 1))
     poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     poses[:, :3, 3] = -np.einsum("bij,bj->bi", poses[:, :3, :3], centers)
-    focal = 1.6 * height
+    focal = 1.5 * height
     intrinsics = torch.tensor([[focal, focal, width / 2, height / 2]]).repeat(views, 1)
     return CameraBatch(intrinsics, torch.from_numpy(poses.astype(np.float32)))
 

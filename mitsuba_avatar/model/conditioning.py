@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last, convolution
 
+
 class Standardization(nn.Module):
     """Shift a signal by its training mean and scale *all* of it by one number: (signal - mean) / max std.
 

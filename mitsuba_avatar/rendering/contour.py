@@ -2,7 +2,7 @@
 
 A pixel is the integral of radiance over its square. Where an edge separates foreground radiance L_f from what lies behind, L_b, moving
 the edge by v pixels along its outward normal n changes the integral by the line integral of (L_f - L_b) n . v. Such edges are contours,
-between a front and a back face; open edges; and seams of the atlas between two front faces, where the texture may jump. On each, k
+between a front and a back face; open edges; and seams of the atlas between two front faces, where the texture may jump. On each,
 stratified positions are evaluated with one ray just outside the edge: a nearer hit means the edge is hidden there; otherwise the hit's
 radiance is L_b (zero for a miss, since images are premultiplied).
 
@@ -28,6 +28,7 @@ from mitsuba_avatar.rendering.visibility import TEA_ROUNDS
 # one counts both (measured on a body of 27k triangles at 128 pixels: gradient bias 35 % with 0.1 pixels, 8 % with 0.01, 0.5 % with 0.0001).
 # It must be above float32 rounding of pixel positions, about 1e-7 of the same length.
 OUTSIDE = 1e-6
+MOST_SAMPLES = 64.0  # on one edge, so that an edge across the whole film cannot outweigh a mesh of tiny ones
 DEPTH_TOLERANCE = 1e-5  # relative; a hit this close in depth is the surface beside the edge, not an occluder
 
 
@@ -115,6 +116,40 @@ class ContourSamples:
     mask: object
 
 
+def allot_samples(batch: SurfaceBatch, kept, samples_per_edge: int) -> tuple:
+    """Share samples out among contour edges by their length on the film, at least one each, `samples_per_edge` on average.
+
+    What makes the estimate noisy is edges that are hidden in part, by the square of their length: at 256 pixels the longest tenth of a
+    body's edges has two thirds of the variance. Measured against the same number on every edge: variance times 0.35.
+
+    Returns:
+        For every sample: its edge's row in `kept`, its number on that edge (stratum), and how many samples that edge has.
+    """
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    view_index = kept // batch.tables.num_edges
+    edge = dr.gather(mi.Vector4u, batch.tables.edges, kept - view_index * batch.tables.num_edges)
+    view = View.gather(batch.views, view_index)
+    base = view.mesh * batch.num_vertices
+    point_a, point_b = (view.to_camera(_vertex(batch.vertices, base + end)) for end in (edge.x, edge.y))
+    length = dr.norm(view.project(point_b) - view.project(point_a))
+    # Edges that cross the camera's plane are not sampled; those that nearly do are long without being important.
+    length = dr.select((point_a.z > NEAR) & (point_b.z > NEAR), dr.minimum(length, float(max(batch.film))), 0.0)
+    dr.eval(length)
+    # Rounding up adds half a sample an edge.
+    spacing = dr.maximum(dr.mean(length) * (1.0 / (samples_per_edge - 0.5)), 1e-6)
+    count = mi.UInt32(dr.clip(dr.ceil(length / spacing), 1.0, MOST_SAMPLES))
+    start = dr.prefix_sum(count, exclusive=True)
+    dr.eval(count, start)
+    total = int(dr.sum(count)[0])
+    begins = dr.zeros(mi.UInt32, total)
+    dr.scatter(begins, mi.UInt32(1), start)
+    row = dr.prefix_sum(begins, exclusive=False) - 1
+    dr.eval(row)
+    return row, dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, start, row), dr.gather(mi.UInt32, count, row)
+
+
 def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSamples | None:
     """Stratified samples on all contour edges of all views; None where there are none."""
     import drjit as dr
@@ -125,8 +160,7 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
     if len(kept) == 0:
         return None
     width, height = batch.film
-    lane = dr.arange(mi.UInt32, len(kept) * samples_per_edge)
-    row = lane // samples_per_edge
+    row, stratum, count = allot_samples(batch, kept, samples_per_edge)
     packed = dr.gather(mi.UInt32, kept, row)
     view_index = packed // tables.num_edges
     edge_index = packed - view_index * tables.num_edges
@@ -140,7 +174,8 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
     point_a, point_b = (view.to_camera(_vertex(batch.vertices, end)) for end in ends)
     pixel_a, pixel_b = view.project(point_a), view.project(point_b)
     random, _ = mi.sample_tea_32(packed, batch.seed_gradient, TEA_ROUNDS)
-    along = (mi.Float(lane - row * samples_per_edge) + mi.Float(random) * 2.0**-32) * (1.0 / samples_per_edge)
+    share = dr.rcp(mi.Float(count))
+    along = (mi.Float(stratum) + mi.Float(random) * 2.0**-32) * share
     step = pixel_b - pixel_a
     length = dr.norm(step)
     position = pixel_a + step * along
@@ -169,7 +204,7 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
         points=(point_a, point_b),
         shares=(1.0 - along, along),
         outward=outward,
-        weight=length * (1.0 / samples_per_edge),
+        weight=length * share,
         radiance=foreground - background,
         mask=dr.select(is_hit, mi.Float(0.0), mi.Float(1.0)),
     )

@@ -57,7 +57,8 @@ class SurfaceRenderer:
         topology: welded faces and per-corner texture coordinates.
         width, height: film size in pixels; crops are made by shifting principal points (`CameraBatch.shifted`), never the film.
         samples_per_pixel: primal rays a pixel, jittered inside it (box filter).
-        boundary_samples_per_edge: stratified positions on every contour edge; silhouette noise falls like its reciprocal.
+        boundary_samples_per_edge: stratified positions on a contour edge, on average (long edges get more); silhouette noise falls like
+            its reciprocal.
     """
 
     def __init__(self, topology: Topology, width: int, height: int, samples_per_pixel: int = 1, boundary_samples_per_edge: int = 2):

@@ -129,9 +129,7 @@ class Presentation:
 
     def _view(self, shot: Shot, images: Float[Tensor, "1 3 H W"], masks: Float[Tensor, "1 1 H W"]) -> View:
         frame = self.evaluator.capture.frames[shot.frame]
-        return View(
-            f"{shot.camera} {frame.split} {frame.number}", as_images(images)[0], masks[0, 0].cpu().numpy()
-        )
+        return View(f"{shot.camera} {frame.split} {frame.number}", as_images(images)[0], masks[0, 0].cpu().numpy())
 
     def _shaded(self, vertices: Float[Tensor, "P V 3"], centers: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 S S"]:
         """Grey textures lit from each camera: the shape alone."""

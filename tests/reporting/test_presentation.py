@@ -72,4 +72,11 @@ def test_geometry_layers_agree_with_the_camera_and_the_mesh(loaded, private_cach
         assert (np.floor(pixels) == np.stack([columns, rows], 1)).mean() > 0.98, "positions project into their own pixels"
         distance = np.linalg.norm(driven.vertices[None] - driven.position[inside][:, None], axis=2).min(axis=1)
         assert distance.max() < 0.1 and np.abs(np.linalg.norm(driven.normal[inside], axis=1) - 1).max() < 1e-3
-        assert driven.uv[inside].std(axis=0).min() > 0.01 and set(driven.layers()) == {"colour", "mask", "depth", "normal", "position", "uv"}
+        assert driven.uv[inside].std(axis=0).min() > 0.01 and set(driven.layers()) == {
+            "colour",
+            "mask",
+            "depth",
+            "normal",
+            "position",
+            "uv",
+        }
