@@ -139,7 +139,7 @@ class LossSettings:
 class TrainingSettings:
     """The optimisation loop."""
 
-    iterations: int = 1200
+    iterations: int = 900
     poses_per_batch: int = 2  # batch size = poses_per_batch * views_per_pose (paper: 8)
     views_per_pose: int = 4
     learning_rate: float = 2e-3  # paper: 1e-3, for days of training
