@@ -91,7 +91,9 @@ def main(arguments: list[str] | None = None) -> int:
         draw_derivative_figure(rig, command.figure)
         return 0
     sys.stdout.write(f"{variant}, {torch.get_num_threads()} torch threads, median of {command.rounds} rounds, milliseconds a view\n")
-    sys.stdout.write("   height x width  views  meshes   ours: forward  +backward   direct_projective: forward  +backward   factor  primary rays\n")
+    sys.stdout.write(
+        "   height x width  views  meshes   ours: forward  +backward   direct_projective: forward  +backward   factor  primary rays\n"
+    )
     rows = []
     for width, height in SIZES:
         for views, meshes in BATCHES:

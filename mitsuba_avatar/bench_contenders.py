@@ -107,7 +107,12 @@ class DirectProjective:
                 image = mi.render(self.scene, parameters, sensor=self.sensors[view], integrator=self.integrator, seed=self.seed, spp=1)
                 if with_gradients:
                     loss = dr.sum(image[:, :, :3] * self.weights[view])
-                    dr.backward(loss, flags=dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges if view + 1 == (mesh + 1) * views_per_mesh else dr.ADFlag.ClearInterior)
+                    dr.backward(
+                        loss,
+                        flags=dr.ADFlag.ClearInterior | dr.ADFlag.ClearEdges
+                        if view + 1 == (mesh + 1) * views_per_mesh
+                        else dr.ADFlag.ClearInterior,
+                    )
                     dr.eval(dr.grad(texture), dr.grad(moved))
                 else:
                     dr.eval(image)

@@ -5,8 +5,8 @@ last two vertices: moving the face by q at the hit point changes the weights so 
 
     db1 = -q . (e2 x d) / D,   db2 = -q . (d x e1) / D,   D = e1 . (e2 x d).
 
-With L(u(b1, b2)) the texture at the hit, the adjoint of the loss reaches q, and from there each vertex by its weight; the derivative along a
-motion of the vertices runs the other way. Silhouettes are not covered by this: `contour` has their share.
+With L(u(b1, b2)) the texture at the hit, the adjoint of the loss reaches q, and from there each vertex by its weight; the derivative
+along a motion of the vertices runs the other way. Silhouettes are not covered by this: `contour` has their share.
 """
 
 from dataclasses import dataclass

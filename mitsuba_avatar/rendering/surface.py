@@ -117,9 +117,7 @@ class SurfaceRenderer:
         seed: int = 0,
     ) -> SurfaceLayers:
         """What `render` draws, and the geometry behind it, from the same pass; arguments and errors are those of `render`."""
-        radiance, mask, layers = self._draw(
-            vertices, textures, cameras, mesh_index, self._call(vertices, textures, seed, has_layers=True)
-        )
+        radiance, mask, layers = self._draw(vertices, textures, cameras, mesh_index, self._call(vertices, textures, seed, has_layers=True))
         normal, depth, position, uv = layers[:, :3], layers[:, 3:4], layers[:, 4:7], layers[:, 8:10]
         return SurfaceLayers(radiance, mask, normal, depth, position, uv)
 

@@ -43,26 +43,24 @@ def losses_of(renderer: SurfaceRenderer, setup: Setup, vertices: Tensor, texture
     return (radiance * setup.weights[:, :3]).sum(), (mask * setup.weights[:, 3:]).sum()
 
 
-def vertex_gradient(renderer: SurfaceRenderer, setup: Setup, repeats: int) -> Estimate:
-    """Mean over seeds of the gradient [P, V, 3] of both losses together."""
+def derivatives(renderer: SurfaceRenderer, setup: Setup, directions: Tensor, repeats: int, reach: float = 0.0) -> Estimate:
+    """Mean over seeds of the derivatives [2, K] of the radiance's and the mask's loss along directions [K, P, V, 3].
+
+    Args:
+        reach: with a finite difference's step, derivatives are taken at evenly spread offsets within it: their mean *is* the finite
+            difference, however the loss curves between, so that a long and therefore quiet step makes a fair reference.
+    """
     samples = []
     for seed in range(repeats):
-        vertices = setup.vertices.clone().requires_grad_()
-        sum(losses_of(renderer, setup, vertices, setup.textures, 1000 + seed)).backward()
-        samples.append(vertices.grad.numpy())
-    return Estimate.of(samples)
-
-
-def derivatives(renderer: SurfaceRenderer, setup: Setup, directions: Tensor, repeats: int) -> Estimate:
-    """Mean over seeds of the derivatives [2, K] of the radiance's and the mask's loss along directions [K, P, V, 3]."""
-    samples = []
-    for seed in range(repeats):
-        rows = []
+        offset = reach * (2 * (seed + 0.5) / repeats - 1)
+        derivative = np.zeros((2, len(directions)))
         for part in range(2):  # a render each: one backward pass may follow it
-            vertices = setup.vertices.clone().requires_grad_()
-            losses_of(renderer, setup, vertices, setup.textures, 1000 + 2 * seed + part)[part].backward()
-            rows.append(torch.einsum("pvc,kpvc->k", vertices.grad.double(), directions.double()).numpy())
-        samples.append(np.stack(rows))
+            for index, direction in enumerate(directions if reach else [torch.zeros_like(setup.vertices)]):
+                vertices = (setup.vertices + offset * direction).requires_grad_()
+                losses_of(renderer, setup, vertices, setup.textures, 1000 + 2 * seed + part)[part].backward()
+                along = torch.einsum("pvc,kpvc->k", vertices.grad.double(), directions.double()).numpy()
+                derivative[part, index if reach else slice(None)] = along[index] if reach else along
+        samples.append(derivative)
     return Estimate.of(samples)
 
 

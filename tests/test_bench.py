@@ -1,0 +1,45 @@
+"""The bench on a small rig and small films: its rows, its table, its figure."""
+
+import json
+
+import pytest
+from PIL import Image
+
+from mitsuba_avatar import bench
+from mitsuba_avatar.body import anny_rig
+from tests.small_rig import make_small_rig
+
+
+@pytest.fixture
+def small(monkeypatch, request):
+    monkeypatch.setattr(anny_rig, "build_anny_rig", make_small_rig)
+    monkeypatch.setattr(bench, "SIZES", ((40, 30),))
+    monkeypatch.setattr(bench, "BATCHES", ((1, 1), (4, 2)))
+    monkeypatch.setattr(bench, "OCCLUSION_SIZE", 32)
+    return ["--variant", request.config.getoption("variant"), "--rounds", "1"]
+
+
+def test_rows_and_table(small, tmp_path, capsys):
+    assert bench.main([*small, "--json", str(tmp_path / "rows.json")]) == 0
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert [(row["width"], row["height"], row["views"], row["meshes"]) for row in rows] == [(40, 30, 1, 1), (40, 30, 4, 2)]
+    for row in rows:
+        assert all(row[name] > 0 for name in ("ours_forward_ms", "ours_ms", "direct_projective_ms", "primary_ms"))
+    printed = capsys.readouterr().out
+    assert "30 x 40" in printed
+    assert "ambient occlusion, 32^2 texels" in printed
+
+
+def test_figure(small, tmp_path, monkeypatch):
+    from mitsuba_avatar import derivative_figure
+
+    monkeypatch.setattr(derivative_figure, "PASSES", 1)
+    monkeypatch.setattr(derivative_figure, "SAMPLES", 4)
+    assert bench.main([*small, "--figure", str(tmp_path / "figure.png")]) == 0
+    with Image.open(tmp_path / "figure.png") as picture:
+        assert picture.width > 800
+
+
+def test_an_unknown_variant_is_refused(capsys):
+    assert bench.main(["--variant", "scalar_rgb"]) == 2
+    assert "expected 'auto', 'llvm_ad_rgb' or 'cuda_ad_rgb'" in capsys.readouterr().err
