@@ -42,4 +42,4 @@ def test_help_lists_flags_and_settings(capsys):
     shown = capsys.readouterr().out
     assert "Fit an avatar." in shown
     assert "--resume" in shown
-    assert "training.iterations (1200)" in shown
+    assert f"training.iterations ({Settings().training.iterations})" in shown

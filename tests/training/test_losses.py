@@ -139,7 +139,7 @@ def test_gradients_equal_finite_differences(topology):
 
 
 def test_mesh_supervision_steps_back_after_its_iterations():
-    settings = LossSettings(geometry=2.0, geometry_iterations=10, geometry_after=0.25, mask=0.0)
+    settings = LossSettings(geometry=2.0, geometry_iterations=10, geometry_after=0.25, mask=0.0, kl=1e-3)
     assert loss_weights(settings, 9) == {"image": 1.0, "geometry": 2.0, "laplacian": 1.0, "kl": 1e-3}
     assert loss_weights(settings, 10)["geometry"] == 0.5
     assert "geometry" not in loss_weights(LossSettings(geometry_iterations=10, geometry_after=0.0), 10)
