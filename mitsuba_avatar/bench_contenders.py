@@ -57,8 +57,12 @@ class DirectProjective:
             np.stack([topology.faces.ravel(), topology.uv_faces.ravel()], axis=1), axis=0, return_inverse=True
         )  # vertices are split along seams: Mitsuba keeps texture coordinates at vertices
         self.source = torch.from_numpy(pairs[:, 0])
-        texture = workload.textures[0].permute(1, 2, 0).numpy()
-        emission = {"type": "area", "radiance": {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(texture)), "raw": True}}
+        # Mitsuba's bitmaps have row 0 at v = 0.
+        self.textures = [mi.TensorXf(texture.flip(1).permute(1, 2, 0).contiguous()) for texture in workload.textures]
+        emission = {
+            "type": "area",
+            "radiance": {"type": "bitmap", "data": mi.TensorXf(self.textures[0].array, self.textures[0].shape), "raw": True},
+        }
         properties = mi.Properties()
         properties["emitter"] = mi.load_dict(emission)
         mesh = mi.Mesh("body", len(pairs), len(topology.faces), has_vertex_texcoords=True, props=properties)
@@ -74,7 +78,6 @@ class DirectProjective:
         (self.texture_key,) = [key for key in self.parameters.keys() if key.endswith("radiance.data")]  # noqa: SIM118
         self.sensors = [mi.load_dict(sensor) for sensor in _sensors(workload)]
         self.positions = [flat_array(vertices[self.source]) for vertices in workload.vertices]
-        self.textures = [mi.TensorXf(np.ascontiguousarray(texture.permute(1, 2, 0).numpy())) for texture in workload.textures]
         self.weights = [mi.TensorXf(np.ascontiguousarray(weights[:3].permute(1, 2, 0).numpy())) for weights in workload.weights]
         dr.eval(self.positions, self.textures, self.weights)
 

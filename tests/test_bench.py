@@ -43,3 +43,29 @@ def test_figure(small, tmp_path, monkeypatch):
 def test_an_unknown_variant_is_refused(capsys):
     assert bench.main(["--variant", "scalar_rgb"]) == 2
     assert "expected 'auto', 'llvm_ad_rgb' or 'cuda_ad_rgb'" in capsys.readouterr().err
+
+
+def test_contenders_draw_the_same_picture(small):
+    """The peer's mesh, texture orientation and cameras are those of the renderer that it is timed against."""
+    import drjit as dr
+    import numpy as np
+    import torch
+
+    from mitsuba_avatar.bench_contenders import DirectProjective
+    from mitsuba_avatar.rendering.backend import loaded_mitsuba
+    from mitsuba_avatar.rendering.surface import SurfaceRenderer
+
+    mi = loaded_mitsuba()
+    workload = bench.make_workload(make_small_rig(), 40, 30, 2, 1)
+    peer = DirectProjective(workload)
+    with torch.no_grad():
+        radiance, _ = SurfaceRenderer(workload.rig.topology, 40, 30, samples_per_pixel=64).render(
+            workload.vertices, workload.textures, workload.cameras
+        )
+    for view in range(2):
+        peer.parameters[peer.texture_key] = peer.textures[view]
+        peer.parameters.update()
+        image = mi.render(peer.scene, sensor=peer.sensors[view], integrator=peer.integrator, seed=1, spp=64)
+        dr.eval(image)
+        np.testing.assert_allclose(np.array(image)[..., :3].transpose(2, 0, 1).mean(), radiance[view].mean(), rtol=0.03)
+        assert np.abs(np.array(image)[..., :3].transpose(2, 0, 1) - radiance[view].numpy()).mean() < 0.15 * float(radiance[view].mean())
