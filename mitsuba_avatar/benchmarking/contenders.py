@@ -5,11 +5,11 @@ coordinates it needs, and no second bounce is sampled (sppi = 0).
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from mitsuba_avatar.benchmarking.workload import Workload
 from mitsuba_avatar.body.mesh import vertex_normals
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.rendering.ambient_occlusion import LIFT, AmbientOcclusion
@@ -17,14 +17,11 @@ from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.bridge import flat_array
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 
-if TYPE_CHECKING:
-    from mitsuba_avatar.bench import Workload
-
 
 class Ours:
     """The surface renderer as training calls it: torch tensors in, a loss over radiance and mask, gradients to vertices and textures."""
 
-    def __init__(self, workload: "Workload"):
+    def __init__(self, workload: Workload):
         self.workload = workload
         self.renderer = SurfaceRenderer(workload.rig.topology, workload.width, workload.height)
         self.seed = 0
@@ -47,7 +44,7 @@ class Ours:
 class DirectProjective:
     """Mitsuba's `direct_projective` on the same mesh, poses and cameras; the texture is the radiance that the mesh emits. No mask."""
 
-    def __init__(self, workload: "Workload"):
+    def __init__(self, workload: Workload):
         import drjit as dr
 
         mi = loaded_mitsuba()
@@ -125,7 +122,7 @@ class DirectProjective:
 class PrimaryRays:
     """One camera ray a pixel through Mitsuba's own hierarchy of the first mesh, all views in one launch, nothing else: a floor."""
 
-    def __init__(self, workload: "Workload"):
+    def __init__(self, workload: Workload):
         mi = loaded_mitsuba()
         topology = workload.rig.topology
         mesh = mi.Mesh("body", topology.num_vertices, len(topology.faces))
@@ -145,7 +142,7 @@ class PrimaryRays:
         dr.sync_thread()
 
 
-def _sensors(workload: "Workload") -> list[dict]:
+def _sensors(workload: Workload) -> list[dict]:
     """Mitsuba sensors of the workload's cameras (z forward, x left, y up there)."""
     mi = loaded_mitsuba()
     sensors = []
@@ -169,7 +166,7 @@ def _sensors(workload: "Workload") -> list[dict]:
     return sensors
 
 
-def _camera_rays(workload: "Workload"):
+def _camera_rays(workload: Workload):
     """Rays through all pixel centres of all views."""
     mi = loaded_mitsuba()
     y, x = torch.meshgrid(torch.arange(workload.height) + 0.5, torch.arange(workload.width) + 0.5, indexing="ij")

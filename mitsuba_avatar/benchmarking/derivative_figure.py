@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mitsuba_avatar.bench import orbit
+from mitsuba_avatar.benchmarking.workload import orbit
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.uv import UvAtlas
 from mitsuba_avatar.files import atomic_path
