@@ -85,12 +85,13 @@ class FrameReader:
             for name in names:
                 mask = capture.mask(name, frame)
                 background = capture.background(name)
-                is_known = background is not None  # on black otherwise
-                images.append(
-                    capture.display_image(name, frame) if is_known else encode(composited(capture.image(name, frame), mask, None), "srgb")
-                )
+                if background is None:
+                    background = np.zeros((self.height, self.width, 3), np.float32)
+                    images.append(encode(composited(capture.image(name, frame), mask, None), "srgb"))
+                else:
+                    images.append(capture.display_image(name, frame))
                 masks.append(mask)
-                backgrounds.append(np.zeros((self.height, self.width, 3), np.float32) if background is None else background)
+                backgrounds.append(background)
                 cameras.append(capture.cameras[name])
         return FrameBatch(
             frames=frames,
