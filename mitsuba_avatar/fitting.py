@@ -17,6 +17,7 @@ from mitsuba_avatar.body.rig import Rig, load_rig
 from mitsuba_avatar.captures.checks import check_values
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.filming.film import default_capture_path, film_capture
+from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.progress import progress_bar
@@ -29,7 +30,7 @@ from mitsuba_avatar.reporting.metrics import read_records
 from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, posed_corners
 from mitsuba_avatar.reporting.tables import terminal_table
 from mitsuba_avatar.reporting.video import write_video
-from mitsuba_avatar.settings import Settings, StudioSettings
+from mitsuba_avatar.settings import Settings
 from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.distributed import Process, join_processes, leave_processes
 from mitsuba_avatar.training.loop import MetricsLog, Trainer

@@ -5,9 +5,8 @@ Values out of range are refused as soon as a section is made, before any long wo
 Units are SI (metres, radians, seconds) and pixels or texels unless a name says otherwise.
 """
 
-import re
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 _RANGES = {
     "positive": lambda value: value > 0,
@@ -17,7 +16,7 @@ _RANGES = {
 }
 
 
-def _expect(settings: Any, expectation: str, *names: str) -> None:
+def expect(settings: Any, expectation: str, *names: str) -> None:
     """Refuse a value outside its range; a tuple must have entries, each within the range."""
     for name in names:
         value = getattr(settings, name)
@@ -37,7 +36,7 @@ class CaptureSettings:
     image_scale: float = 1.0  # images and cameras are resized by this factor when read
 
     def __post_init__(self) -> None:
-        _expect(self, "positive", "image_scale")
+        expect(self, "positive", "image_scale")
 
 
 @dataclass(frozen=True)
@@ -74,11 +73,11 @@ class ModelSettings:
     texture_scale: float = 0.2  # radiance that one unit of decoder output adds to the mean texture
 
     def __post_init__(self) -> None:
-        _expect(self, "positive", "latent_size", "latent_channels", "pose_embedding_channels", "face_embedding_channels")
-        _expect(self, "positive", "decoder_channels", "geometry_channels", "texture_channels", "view_channels")
-        _expect(self, "positive", "encoder_channels", "shadow_channels", "displacement_scale", "texture_scale")
-        _expect(self, "a power of two", "conditioning_size", "geometry_size", "texture_size")
-        _expect(self, "a power of two", "view_size", "encoder_size", "shadow_downscale")
+        expect(self, "positive", "latent_size", "latent_channels", "pose_embedding_channels", "face_embedding_channels")
+        expect(self, "positive", "decoder_channels", "geometry_channels", "texture_channels", "view_channels")
+        expect(self, "positive", "encoder_channels", "shadow_channels", "displacement_scale", "texture_scale")
+        expect(self, "a power of two", "conditioning_size", "geometry_size", "texture_size")
+        expect(self, "a power of two", "view_size", "encoder_size", "shadow_downscale")
         for name, least in (("geometry_size", 1), ("texture_size", 2), ("view_size", 1)):
             if getattr(self, name) < least * self.conditioning_size:
                 raise ValueError(
@@ -116,7 +115,7 @@ class RenderingSettings:
     ambient_occlusion_distance: float = 0.6  # metres; hits farther away do not occlude
 
     def __post_init__(self) -> None:
-        _expect(self, "positive", "samples_per_pixel", "boundary_samples_per_edge", "ambient_occlusion_rays", "ambient_occlusion_distance")
+        expect(self, "positive", "samples_per_pixel", "boundary_samples_per_edge", "ambient_occlusion_rays", "ambient_occlusion_distance")
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,7 @@ class LossSettings:
     geometry_after: float = 0.3  # factor on `geometry` after that; 0 as in the paper, where the tracked mesh is worse than the images
 
     def __post_init__(self) -> None:
-        _expect(self, "zero or more", "image", "mask", "geometry", "laplacian", "kl", "geometry_iterations", "geometry_after")
+        expect(self, "zero or more", "image", "mask", "geometry", "laplacian", "kl", "geometry_iterations", "geometry_after")
 
 
 @dataclass(frozen=True)
@@ -151,11 +150,9 @@ class TrainingSettings:
     preview_every: int = 200
 
     def __post_init__(self) -> None:
-        _expect(
-            self, "positive", "iterations", "poses_per_batch", "views_per_pose", "learning_rate", "learning_rate_final", "gradient_clip"
-        )
-        _expect(self, "positive", "checkpoint_every", "validate_every", "preview_every")
-        _expect(self, "zero or more", "seed")
+        expect(self, "positive", "iterations", "poses_per_batch", "views_per_pose", "learning_rate", "learning_rate_final", "gradient_clip")
+        expect(self, "positive", "checkpoint_every", "validate_every", "preview_every")
+        expect(self, "zero or more", "seed")
 
 
 @dataclass(frozen=True)
@@ -169,7 +166,7 @@ class EvaluationSettings:
     samples_per_pixel: int = 16
 
     def __post_init__(self) -> None:
-        _expect(self, "positive", "frames_per_split", "orbit_frames", "orbit_width", "orbit_height", "samples_per_pixel")
+        expect(self, "positive", "frames_per_split", "orbit_frames", "orbit_width", "orbit_height", "samples_per_pixel")
 
 
 @dataclass(frozen=True)
@@ -182,38 +179,3 @@ class Settings:
     loss: LossSettings = field(default_factory=LossSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
-
-
-@dataclass(frozen=True)
-class StudioSettings:
-    """What the capture studio films."""
-
-    name: str = "default"
-    person: Literal["anny"] = "anny"  # whose body; the parametric body of the package `anny` is the one there is
-    train_cameras: int = 10
-    held_out_cameras: int = 3
-    width: int = 192
-    height: int = 256
-    fps: float = 10.0
-    train_frames: int = 120
-    test_frames: int = 30
-    samples_per_pixel: int = 16  # camera rays; a square number stratifies best
-    light_samples: int = 3  # paths that go on from each camera ray's hit
-    max_depth: int = 3  # segments of a path, counting the camera's: 3 is one bounce of indirect light
-    texture_size: int = 512  # texels along a side of what the person is painted with
-    background: float = 0.06  # linear radiance of the constant backdrop
-    scene: str = "dome"  # a file of scenes/, without its ending, or a path to an XML file
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        _expect(
-            self, "positive", "train_cameras", "width", "height", "fps", "train_frames", "samples_per_pixel", "light_samples", "max_depth"
-        )
-        _expect(self, "zero or more", "held_out_cameras", "test_frames", "seed")
-        _expect(self, "between 0 and 1", "background")
-        _expect(self, "a power of two", "texture_size")
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
-            raise ValueError(
-                f"StudioSettings(): expected name to be letters, digits, '_', '-' and '.', since it names a folder; "
-                f"got {self.name!r}. Choose another."
-            )

@@ -9,10 +9,10 @@ import time
 from dataclasses import dataclass
 
 from mitsuba_avatar.command_line import parse_command
+from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.progress import progress_bar
 from mitsuba_avatar.rendering import backend
-from mitsuba_avatar.settings import StudioSettings
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def film(settings: StudioSettings, out: str = "") -> str:
 
     started = time.perf_counter()
     folder = out or str(default_capture_path(settings))
-    total = settings.train_frames + settings.test_frames
+    total = settings.motion.train_frames + settings.motion.test_frames
     with progress_bar("filming", total) as bar:
         capture = film_capture(settings, folder, progress=lambda done, total: bar.update(done, total))
     sys.stderr.write(

@@ -6,8 +6,9 @@ from typing import Literal
 
 import pytest
 
+from mitsuba_avatar.filming.settings import MotionSettings, StudioSettings
 from mitsuba_avatar.presets import load_settings, nearest_key, resolve, save_settings
-from mitsuba_avatar.settings import Settings, StudioSettings
+from mitsuba_avatar.settings import Settings
 
 
 def write_preset(folder: Path, text: str) -> Path:
@@ -43,7 +44,7 @@ def test_an_empty_list_is_read_as_one():
 
 
 def test_flat_settings_use_the_same_machinery():
-    assert resolve(None, ["train_frames=4", "--fps", "12.5"], StudioSettings).train_frames == 4
+    assert resolve(None, ["motion.train_frames=4", "--motion.fps", "12.5"], StudioSettings).motion.train_frames == 4
 
 
 def test_saved_settings_are_read_back_equal(tmp_path):
@@ -58,7 +59,7 @@ def test_saved_settings_are_read_back_equal(tmp_path):
 
 
 def test_saved_studio_settings_are_read_back_equal(tmp_path):
-    settings = StudioSettings(name="study", fps=29.97)
+    settings = StudioSettings(name="study", motion=MotionSettings(fps=29.97))
     save_settings(tmp_path / "studio.yaml", settings)
     assert load_settings(tmp_path / "studio.yaml", StudioSettings) == settings
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from mitsuba_avatar.settings import LossSettings, ModelSettings, StudioSettings
+from mitsuba_avatar.filming.settings import StudioSettings
+from mitsuba_avatar.settings import LossSettings, ModelSettings
 
 
 def test_values_given_in_python_are_checked_too():

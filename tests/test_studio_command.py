@@ -3,11 +3,11 @@ from pathlib import Path
 import pytest
 
 from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.presets import resolve
-from mitsuba_avatar.settings import StudioSettings
 from mitsuba_avatar.studio import main
 
-SMALL = ["--preset", "tiny", "train_frames", "2", "test_frames=1", "train_cameras=2", "texture_size=64"]
+SMALL = ["--preset", "tiny", "motion.train_frames", "2", "motion.test_frames=1", "cameras.train=2", "clothing.texture_size=64"]
 
 
 def test_it_films_a_capture_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -33,8 +33,8 @@ def test_without_a_folder_it_films_into_the_cache(tmp_path: Path, capsys: pytest
     ("words", "message"),
     [
         (["smaples_per_pixel", "4"], "samples_per_pixel"),
-        (["train_frames", "0"], "expected train_frames to be positive; got 0"),
-        (["scene", "doom"], "got 'doom'. Known names: dome"),
+        (["motion.train_frames", "0"], "expected train_frames to be positive; got 0"),
+        (["light.scene", "doom"], "got 'doom'. Known names: dome"),
         (["--preset", "huge"], "got 'studio/huge'"),
     ],
 )

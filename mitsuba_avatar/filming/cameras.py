@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from mitsuba_avatar.captures.cameras import Camera, look_at
-from mitsuba_avatar.settings import StudioSettings
+from mitsuba_avatar.filming.settings import StudioSettings
 
 DISTANCE = 3.6  # metres from the dome's axis
 RINGS = (-0.10, 0.22, 0.55)  # elevation of the rings, radians, seen from the person's middle; the middle ring holds every other camera
@@ -51,8 +51,8 @@ def place_cameras(vertices: Float[np.ndarray, "N V 3"], settings: StudioSettings
     low, high = points.min(axis=0), points.max(axis=0)
     target = 0.5 * (low + high)
     rng = np.random.default_rng([settings.seed, 77])
-    positions = _train_positions(settings.train_cameras) + _held_out_positions(settings.held_out_cameras)
-    counts = {"train": settings.train_cameras, "held_out": settings.held_out_cameras}
+    positions = _train_positions(settings.cameras.train) + _held_out_positions(settings.cameras.held_out)
+    counts = {"train": settings.cameras.train, "held_out": settings.cameras.held_out}
     names = [f"{kind}_{index:02d}" for kind, count in counts.items() for index in range(count)]
     cameras = {}
     for name, (azimuth, elevation) in zip(names, positions, strict=True):
@@ -62,7 +62,7 @@ def place_cameras(vertices: Float[np.ndarray, "N V 3"], settings: StudioSettings
         # Look at the middle of what is seen from here, not of the box.
         towards_middle = np.append(_bounds(look_at(centre, target), points).mean(axis=0), 1.0) @ look_at(centre, target)[:3, :3]
         cameras[name] = _framed(name, look_at(centre, centre + towards_middle), points, settings, rng)
-    return DomeCameras(cameras, tuple(names[settings.train_cameras :]))
+    return DomeCameras(cameras, tuple(names[settings.cameras.train :]))
 
 
 def _train_positions(count: int) -> list[tuple[float, float]]:
@@ -87,14 +87,14 @@ def _bounds(camera_from_world: np.ndarray, points: np.ndarray) -> Float64[np.nda
 def _framed(name: str, camera_from_world: np.ndarray, points: np.ndarray, settings: StudioSettings, rng: np.random.Generator) -> Camera:
     """The longest lens with which all points stay inside the image, less a jitter; the principal point off-centre by a few pixels."""
     low, high = _bounds(camera_from_world, points)
-    size = np.array([settings.width, settings.height], dtype=np.float64)
+    size = np.array([settings.cameras.width, settings.cameras.height], dtype=np.float64)
     focal = float(((1 - 2 * MARGIN) * size / (high - low)).min()) * (1 - FOCAL_JITTER * rng.uniform(0, 1))
     # The margin holds the jitter: nothing is cut.
-    centre = 0.5 * size - focal * 0.5 * (low + high) + PRINCIPAL_JITTER * settings.width * rng.uniform(-1, 1, 2)
+    centre = 0.5 * size - focal * 0.5 * (low + high) + PRINCIPAL_JITTER * settings.cameras.width * rng.uniform(-1, 1, 2)
     return Camera(
         name=name,
-        width=settings.width,
-        height=settings.height,
+        width=settings.cameras.width,
+        height=settings.cameras.height,
         fx=focal,
         fy=focal,
         cx=float(centre[0]),

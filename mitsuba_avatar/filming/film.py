@@ -32,10 +32,10 @@ from mitsuba_avatar.filming.cameras import DomeCameras, place_cameras
 from mitsuba_avatar.filming.clothing import dress, hair, shirt, trousers
 from mitsuba_avatar.filming.contact_sheet import save_contact_sheet
 from mitsuba_avatar.filming.motion import Motion, perform
+from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.filming.stage import Stage
 from mitsuba_avatar.filming.wrinkles import KinematicCloth
 from mitsuba_avatar.resources import find_resource
-from mitsuba_avatar.settings import StudioSettings
 
 FILMING_VERSION = 4  # raised when what filming makes of the same settings changes, so that older cached captures are not taken
 PERSONS: dict[str, Callable[[], Rig]] = {"anny": build_anny_rig}
@@ -76,13 +76,13 @@ def stage_performance(settings: StudioSettings) -> Performance:
     body = dress(anatomy, (trousers(anatomy, top), top, hair(anatomy)))
     names, displacements = facial_action_displacements()
     motion = perform(bare, settings, names)
-    folds = KinematicCloth(anatomy, body, settings.seed).displacements(motion.theta, settings.fps, motion.segments())
+    folds = KinematicCloth(anatomy, body, settings.seed).displacements(motion.theta, settings.motion.fps, motion.segments())
     face = np.einsum("na,avc->nvc", motion.actions, displacements, optimize=True)
     rest = (body.vertices + folds + face).astype(np.float32)
     train = [index for index, frame in enumerate(motion.frames) if frame.split == "train"]
     rig = dataclasses.replace(bare, rest_vertices=rest[train].mean(axis=0))
     root, vertices = _on_floor(motion.root, _posed(rig, motion, rest))
-    appearance = paint(anatomy, body, settings.texture_size, settings.seed)
+    appearance = paint(anatomy, body, settings.clothing.texture_size, settings.seed)
     return Performance(rig, appearance, dataclasses.replace(motion, root=root), rest, vertices)
 
 
@@ -101,7 +101,7 @@ def film_capture(settings: StudioSettings, folder: Path | str, progress: Progres
     folder = Path(folder)
     if (folder / "capture.yaml").is_file() and _filmed_with(folder) == _signature(settings):
         return Capture.open(folder)
-    find_resource("scenes", settings.scene, ".xml")  # a wrong name is told before the work, not after
+    find_resource("scenes", settings.light.scene, ".xml")  # a wrong name is told before the work, not after
     performance = stage_performance(settings)
     dome = place_cameras(performance.vertices, settings)
     writer = CaptureWriter(folder, _describe(performance.rig, dome, settings), dome.cameras, performance.motion.frames)
@@ -151,9 +151,9 @@ def _describe(rig: Rig, dome: DomeCameras, settings: StudioSettings) -> CaptureD
     axes = [f"{name}_{axis}" for name in rig.face_keypoint_names for axis in "xyz"]
     return CaptureDescription(
         name=settings.name,
-        fps=settings.fps,
+        fps=settings.motion.fps,
         colour_curve="srgb",
-        lighting={"scene": settings.scene},
+        lighting={"scene": settings.light.scene},
         background=(_backdrop(settings),) * 3,
         face_signal="keypoints",
         face_names=tuple(axes),
@@ -166,7 +166,7 @@ def _describe(rig: Rig, dome: DomeCameras, settings: StudioSettings) -> CaptureD
 
 def _backdrop(settings: StudioSettings) -> float:
     """The backdrop's linear radiance, as the nearest 8-bit value: images then hold exactly what the description says."""
-    return float(decode_bytes(encode_bytes(np.array([settings.background]), "srgb"), "srgb")[0])
+    return float(decode_bytes(encode_bytes(np.array([settings.light.background]), "srgb"), "srgb")[0])
 
 
 def _signature(settings: StudioSettings) -> str:

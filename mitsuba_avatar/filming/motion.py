@@ -18,7 +18,7 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.captures.frames import Frame
 from mitsuba_avatar.filming.face import conversation_face, expression_tour, resting_face
-from mitsuba_avatar.settings import StudioSettings
+from mitsuba_avatar.filming.settings import StudioSettings
 
 SIDES = ("left", "right")
 SHARE_OF_LIMITS = 0.75  # of an angle's range, unless SAFE says otherwise
@@ -116,13 +116,13 @@ def perform(rig: Rig, settings: StudioSettings, action_names: Sequence[str], tak
     theta, root, actions = [], [], []
     for order, (take, count) in enumerate(_divide(takes, settings)):
         rng = np.random.default_rng([settings.seed, order])
-        time = np.arange(count) / settings.fps
+        time = np.arange(count) / settings.motion.fps
         angles = {"range": _range_of_motion, "conversation": _conversation, "recombined": _recombined}[take.style](rig, take, time, rng)
         gaze, face = _face(take, time, action_names, rng)
         theta.append(_with_gaze(rig, angles, gaze))
         root.append(_wander(time, rng, turn=0.12 if take.style == "range" else 0.45))
         actions.append(face)
-        frames += [Frame(len(frames) + index, (len(frames) + index) / settings.fps, take.split, take.name) for index in range(count)]
+        frames += [Frame(len(frames) + index, (len(frames) + index) / settings.motion.fps, take.split, take.name) for index in range(count)]
     limits = rig.dofs.lower, rig.dofs.upper
     all_theta = np.clip(np.concatenate(theta), *limits).astype(np.float32)
     planted = plant_feet(rig, all_theta, np.concatenate(root).astype(np.float32))
@@ -151,7 +151,7 @@ def plant_feet(rig: Rig, theta: Float32[np.ndarray, "N D"], root: Float32[np.nda
 def _divide(takes: tuple[Take, ...], settings: StudioSettings) -> list[tuple[Take, int]]:
     """Number of frames of each take: shares of the split's frames, rounded so that they add up; takes of no frame are left out."""
     counts = []
-    for split, total in (("train", settings.train_frames), ("test", settings.test_frames)):
+    for split, total in (("train", settings.motion.train_frames), ("test", settings.motion.test_frames)):
         chosen = [take for take in takes if take.split == split]
         ends = np.rint(np.cumsum([take.share for take in chosen]) / sum(take.share for take in chosen) * total).astype(int)
         counts += [(take, int(count)) for take, count in zip(chosen, np.diff(ends, prepend=0), strict=True) if count]

@@ -18,8 +18,8 @@ from mitsuba_avatar.body.mesh import vertex_normals
 from mitsuba_avatar.body.rig import Topology
 from mitsuba_avatar.captures.cameras import Camera
 from mitsuba_avatar.filming.appearance import Appearance
+from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.resources import find_resource
-from mitsuba_avatar.settings import StudioSettings
 
 SPECULAR = 0.35  # of the principled BSDF: reflectance 0.028 at normal incidence, as of skin
 SPECULAR_SAMPLES = 0.12  # share of samples for the specular lobe; the default of a half doubles the noise of the diffuse one
@@ -39,13 +39,13 @@ class Stage:
         import mitsuba_avatar.filming.path_integrator  # noqa: F401
 
         self.width, self.height, self.count = cameras[0].width, cameras[0].height, len(cameras)
-        self.samples_per_pixel = settings.samples_per_pixel
+        self.samples_per_pixel = settings.light.samples_per_pixel
         corners = np.stack([topology.faces.reshape(-1), topology.uv_faces.reshape(-1)], axis=1)
         pairs, corner_pair = np.unique(corners, axis=0, return_inverse=True)  # [S, 2] vertex and uv of each split vertex
         self.welded = pairs[:, 0]
         self.faces = torch.from_numpy(topology.faces)
 
-        file = find_resource("scenes", settings.scene, ".xml")
+        file = find_resource("scenes", settings.light.scene, ".xml")
         parts = _parts_of(file, settings) | {"person": _mesh(topology, appearance, pairs, corner_pair.reshape(-1, 3))}
         self.scene = mi.load_dict({"type": "scene", **parts})
         self.sensor = mi.load_dict(_batch_sensor(cameras, settings))
@@ -73,7 +73,7 @@ class Stage:
 def _parts_of(file: Path, settings: StudioSettings) -> dict[str, object]:
     """Integrator, objects and lights of an XML scene, by invented names."""
     # Mitsuba refuses parameters that a file does not declare.
-    known = {"max_depth": str(settings.max_depth), "splits": str(settings.light_samples)}
+    known = {"max_depth": str(settings.light.max_depth), "splits": str(settings.light.light_samples)}
     text = file.read_text(encoding="utf-8")
     given = {name: value for name, value in known.items() if f"${name}" in text}
     scene = mi.load_file(str(file), **given)
@@ -116,7 +116,7 @@ def _batch_sensor(cameras: Sequence[Camera], settings: StudioSettings) -> dict[s
             "Stage(): expected cameras of one size and without distortion; got others. Give all cameras the size of the first."
         )
     film = {"type": "hdrfilm", "pixel_format": "rgba", "component_format": "float32", "rfilter": {"type": "box"}}
-    sampler = {"type": "multijitter", "sample_count": settings.samples_per_pixel}
+    sampler = {"type": "multijitter", "sample_count": settings.light.samples_per_pixel}
     sensors = {camera.name: sensor_of(camera) | {"film": film | {"width": width, "height": height}} for camera in cameras}
     return {"type": "batch", "film": film | {"width": width * len(cameras), "height": height}, "sampler": sampler, **sensors}
 

@@ -7,8 +7,8 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.filming.anatomy import Anatomy
 from mitsuba_avatar.filming.clothing import DressedBody, dress, hair, shirt, trousers
 from mitsuba_avatar.filming.film import Performance, stage_performance
+from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.presets import resolve
-from mitsuba_avatar.settings import StudioSettings
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import numpy as np
 
 from mitsuba_avatar.filming.cameras import look_at, place_cameras
 from mitsuba_avatar.filming.film import Performance
-from mitsuba_avatar.settings import StudioSettings
+from mitsuba_avatar.filming.settings import StudioSettings
 
 
 def test_nothing_is_cut_in_any_frame_and_the_body_fills_the_image(performance: Performance):
@@ -13,8 +13,8 @@ def test_nothing_is_cut_in_any_frame_and_the_body_fills_the_image(performance: P
         pixels, depth = camera.project(performance.vertices.reshape(-1, 3))
         assert depth.min() > 1
         low, high = pixels.min(axis=0), pixels.max(axis=0)
-        assert (low > 1).all() and (high < np.array([settings.width, settings.height]) - 1).all(), camera.name
-        assert ((high - low) / [settings.width, settings.height]).max() > 0.85, camera.name
+        assert (low > 1).all() and (high < np.array([settings.cameras.width, settings.cameras.height]) - 1).all(), camera.name
+        assert ((high - low) / [settings.cameras.width, settings.cameras.height]).max() > 0.85, camera.name
 
 
 def test_cameras_stand_all_around_and_held_out_ones_between(performance: Performance):
@@ -33,8 +33,8 @@ def test_lenses_differ_and_principal_points_are_off_centre(performance: Performa
     settings = StudioSettings()
     cameras = list(place_cameras(performance.vertices[:, ::11], settings).cameras.values())
     assert len({round(camera.fx, 3) for camera in cameras}) == len(cameras)
-    offsets = np.array([[camera.cx - settings.width / 2, camera.cy - settings.height / 2] for camera in cameras])
-    assert np.abs(offsets).max() < 0.12 * settings.width and np.abs(offsets).min(axis=1).max() > 0.2
+    offsets = np.array([[camera.cx - settings.cameras.width / 2, camera.cy - settings.cameras.height / 2] for camera in cameras])
+    assert np.abs(offsets).max() < 0.12 * settings.cameras.width and np.abs(offsets).min(axis=1).max() > 0.2
 
 
 def test_the_seed_decides_the_cameras(performance: Performance):

@@ -12,7 +12,7 @@ from mitsuba_avatar.body.skinning import unpose_vertices
 from mitsuba_avatar.captures.checks import check_values
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.filming.film import CONTACT_SHEET, Performance, default_capture_path, film_capture
-from mitsuba_avatar.settings import StudioSettings
+from mitsuba_avatar.filming.settings import StudioSettings
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_a_filmed_capture_is_whole_and_passes_every_check(folder: Path, settings
     assert (len(capture.camera_names(held_out=False)), len(capture.camera_names(held_out=True))) == (3, 1)
     assert (len(capture.frame_indices("train")), len(capture.frame_indices("test"))) == (8, 4)
     image, mask = capture.image("train_01", 5), capture.mask("train_01", 5)
-    assert image.shape == (settings.height, settings.width, 3) and 0.03 < mask.mean() < 0.6
+    assert image.shape == (settings.cameras.height, settings.cameras.width, 3) and 0.03 < mask.mean() < 0.6
     np.testing.assert_array_equal(image[mask == 0][0], np.float32(capture.description.background))
     assert (folder / CONTACT_SHEET).is_file()
 

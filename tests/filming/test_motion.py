@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -8,7 +6,7 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.filming.film import Performance
 from mitsuba_avatar.filming.motion import Motion, perform
-from mitsuba_avatar.settings import StudioSettings
+from mitsuba_avatar.filming.settings import MotionSettings, StudioSettings
 
 NAMES = ("eyeBlinkLeft", "eyeBlinkRight", "jawOpen", "mouthSmileLeft")
 
@@ -39,7 +37,7 @@ def test_frames_are_counted_per_split_and_segments_are_runs(rig: Rig, motion: Mo
 
 
 def test_odd_counts_add_up(rig: Rig):
-    motion = perform(rig, StudioSettings(train_frames=7, test_frames=1), NAMES)
+    motion = perform(rig, StudioSettings(motion=MotionSettings(train_frames=7, test_frames=1)), NAMES)
     assert [frame.split for frame in motion.frames].count("train") == 7 and len(motion.theta) == 8
 
 
@@ -84,6 +82,6 @@ def test_the_lowest_point_is_on_the_floor_in_every_frame(performance: Performanc
 
 def test_more_frames_of_the_same_speed_at_another_rate(rig: Rig):
     """Conversation is a function of time: at twice the frame rate, every other frame shows the same pose."""
-    slow = perform(rig, StudioSettings(train_frames=1, test_frames=20), NAMES)
-    fast = perform(rig, dataclasses.replace(StudioSettings(train_frames=1, test_frames=40), fps=20.0), NAMES)
+    slow = perform(rig, StudioSettings(motion=MotionSettings(train_frames=1, test_frames=20)), NAMES)
+    fast = perform(rig, StudioSettings(motion=MotionSettings(train_frames=1, test_frames=40, fps=20.0)), NAMES)
     np.testing.assert_allclose(slow.theta[13:], fast.theta[25::2][: len(slow.theta[13:])], atol=1e-5)

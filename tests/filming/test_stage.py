@@ -11,16 +11,18 @@ from mitsuba_avatar.filming.anatomy import LEG, Anatomy
 from mitsuba_avatar.filming.appearance import Appearance
 from mitsuba_avatar.filming.cameras import look_at, place_cameras
 from mitsuba_avatar.filming.film import Performance
+from mitsuba_avatar.filming.settings import CameraSettings, LightSettings, StudioSettings
 from mitsuba_avatar.filming.stage import Stage, sensor_of
 from mitsuba_avatar.resources import resource_folder
-from mitsuba_avatar.settings import StudioSettings
 
 GREY = Appearance(np.full((64, 64, 3), 0.5, np.float32), np.full((64, 64), 0.8, np.float32))  # only light and shadow vary
 
 
 @pytest.fixture(scope="module")
 def shoot_settings() -> StudioSettings:
-    return StudioSettings(train_cameras=3, held_out_cameras=0, width=72, height=104, samples_per_pixel=16, light_samples=2)
+    return StudioSettings(
+        cameras=CameraSettings(train=3, held_out=0, width=72, height=104), light=LightSettings(samples_per_pixel=16, light_samples=2)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,7 @@ def test_the_body_shadows_itself(performance: Performance, shoot_settings: Studi
     rig = performance.rig
     frontal = look_at(np.array([0.0, -3.6, 0.9]), np.array([0.0, 0.0, 0.9]))
     camera = Camera("front", 72, 104, 180.0, 180.0, 36.0, 52.0, frontal)
-    stage = Stage(rig.topology, GREY, [camera], dataclasses.replace(shoot_settings, samples_per_pixel=64))
+    stage = Stage(rig.topology, GREY, [camera], dataclasses.replace(shoot_settings, light=LightSettings(samples_per_pixel=64)))
     legs = {side: Anatomy.of(rig).weight(LEG, side) > 0.5 for side in "LR"}
     whole = rig.rest_vertices.copy()
     one_legged = whole.copy()
@@ -95,7 +97,7 @@ def test_a_scene_of_the_users_own(performance: Performance, cameras: list[Camera
         </integrator><shape type="rectangle"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/>
         </transform><emitter type="area"><rgb name="radiance" value="8"/></emitter></shape></scene>"""
     )
-    lit = dataclasses.replace(shoot_settings, scene=str(file), samples_per_pixel=4)
+    lit = dataclasses.replace(shoot_settings, light=LightSettings(scene=str(file), samples_per_pixel=4))
     radiance, coverage = Stage(performance.rig.topology, GREY, cameras, lit).shoot(performance.vertices[0], seed=0)
     assert np.quantile(radiance[coverage == 1], 0.9) > 0.05
 
