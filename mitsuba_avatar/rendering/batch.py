@@ -7,15 +7,16 @@ from mitsuba_avatar.rendering.surface_tables import SurfaceTables
 
 
 @dataclass
-class Boxes:
-    """Pixel tiles that each view must trace, as columns on the device, and the farthest depth of its mesh."""
+class ViewBounds:
+    """Where a batch's views can show anything.
 
-    tile_x: object
-    tile_y: object
-    tiles_per_row: object
-    start: object
+    Attributes:
+        tiles: [T] indices of pixel tiles among those of all films, row by row, view after view.
+        depth_limit: [B] metres; nothing of a view's mesh lies farther away.
+    """
+
+    tiles: object
     depth_limit: object
-    num_tiles: int
 
 
 @dataclass
@@ -31,7 +32,7 @@ class SurfaceBatch:
         texture_size: (h, w) texels.
         film: (width, height) pixels.
         seed, seed_gradient: opaque UInt32, decorrelated.
-        boxes: filled once the views' bounds are known.
+        bounds: filled once the vertices are projected.
     """
 
     scene: MeshScene
@@ -46,7 +47,7 @@ class SurfaceBatch:
     samples_per_pixel: int
     seed: object
     seed_gradient: object
-    boxes: Boxes | None = None
+    bounds: ViewBounds | None = None
 
     @property
     def num_vertices(self) -> int:

@@ -29,6 +29,7 @@ from mitsuba_avatar.rendering.visibility import TEA_ROUNDS
 # above float32 rounding of pixel positions, 6e-8 of the same length: with 1e-7 rays hit the face that they should pass.
 OUTSIDE = 4e-7
 MOST_SAMPLES = 32.0  # times the average, on one edge: one across the whole film must not outweigh a mesh of tiny ones
+VIEWS_PER_WORD = 32  # bits of an integer
 DEPTH_TOLERANCE = 1e-5  # relative; a hit this close in depth is the surface beside the edge, not an occluder
 
 
@@ -49,47 +50,100 @@ def face_planes(batch: SurfaceBatch):
     return planes
 
 
-def convex_edges(batch: SurfaceBatch, planes):
-    """Bool [P * E]: the second face lies behind the first one's plane. Where a contour edge is concave, the back face lies in front of the
-    front face: the edge hides itself, from every view.
+def views_from_front(batch: SurfaceBatch, planes):
+    """Bits [words * P * F]: bit k of word w says whether view 32 w + k looks at the face's mesh and sees the face from the front."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    num_planes = batch.scene.num_meshes * batch.tables.num_faces
+    lane = dr.arange(mi.UInt32, _num_words(batch) * num_planes)
+    word = lane // num_planes
+    plane_index = lane - word * num_planes
+    plane = dr.gather(mi.Vector4f, planes, plane_index)
+    mesh = mi.Float(plane_index // batch.tables.num_faces)
+    bits = mi.UInt32(0)
+    for k in range(min(VIEWS_PER_WORD, batch.num_views)):
+        view = word * VIEWS_PER_WORD + k
+        center = dr.gather(mi.Vector4f, batch.centers, view, view < batch.num_views)
+        bits |= dr.select((view < batch.num_views) & (center.w == mesh) & (_height(plane, center) > 0), mi.UInt32(1 << k), 0)
+    dr.eval(bits)
+    return bits
+
+
+@dataclass(frozen=True)
+class EdgeViews:
+    """Per edge of every mesh, as bits over views: [words * P * E] each.
+
+    Attributes:
+        first_front: its first face is seen from the front; front_seam: both are, and their texture coordinates differ.
+        is_boundary: Bool [B * E], not bits: radiance may jump across the edge of the view's mesh.
+    """
+
+    first_front: object
+    front_seam: object
+    is_boundary: object
+
+
+def edge_views(batch: SurfaceBatch, planes) -> EdgeViews:
+    """Classify the edges for all views at once.
+
+    A contour lies between a front and a back face. Where it is concave, the back face lies before the front face: the edge hides
+    itself, from every view.
     """
     import drjit as dr
 
     mi = loaded_mitsuba()
     tables = batch.tables
-    lane = dr.arange(mi.UInt32, batch.scene.num_meshes * tables.num_edges)
-    mesh = lane // tables.num_edges
-    edge = lane - mesh * tables.num_edges
-    first_face = dr.gather(mi.Vector4u, tables.edges, edge).z
-    opposite = _vertex(batch.vertices, mesh * batch.num_vertices + dr.gather(mi.UInt32, tables.edge_opposite, edge))
-    is_convex = _height(dr.gather(mi.Vector4f, planes, mesh * tables.num_faces + first_face), opposite) < 0
-    dr.eval(is_convex)
-    return is_convex
+    front = views_from_front(batch, planes)
+    num_edges, num_planes = batch.scene.num_meshes * tables.num_edges, batch.scene.num_meshes * tables.num_faces
+    lane = dr.arange(mi.UInt32, _num_words(batch) * num_edges)
+    word = lane // num_edges
+    mesh = (lane - word * num_edges) // tables.num_edges
+    edge_index = lane - word * num_edges - mesh * tables.num_edges
+    edge = dr.gather(mi.Vector4u, tables.edges, edge_index)
+    is_open = edge.w == NO_FACE
+    faces = mesh * tables.num_faces
+    first = dr.gather(mi.UInt32, front, word * num_planes + faces + edge.z)
+    second = dr.gather(mi.UInt32, front, word * num_planes + faces + edge.w, ~is_open)
+    opposite = _vertex(batch.vertices, mesh * batch.num_vertices + dr.gather(mi.UInt32, tables.edge_opposite, edge_index))
+    is_convex = _height(dr.gather(mi.Vector4f, planes, faces + edge.z), opposite) < 0
+    seam = dr.select(edge_index < tables.num_seams, first & second, 0)
+    silhouette = dr.select(is_convex, first ^ second, 0)
+    boundary = dr.select(is_open, mi.UInt32(0xFFFFFFFF), silhouette | seam)
+    is_boundary = dr.empty(mi.Bool, batch.num_views * tables.num_edges)
+    for k in range(min(VIEWS_PER_WORD, batch.num_views)):
+        view = word * VIEWS_PER_WORD + k
+        is_own = view < batch.num_views
+        if batch.scene.num_meshes > 1:
+            is_own &= mi.UInt32(dr.gather(mi.Float, batch.centers, view * 4 + 3, is_own)) == mesh
+        # Scattered from here, since a kernel that reads little but by index has costs of its own.
+        dr.scatter(is_boundary, (boundary >> k) & 1 == 1, view * tables.num_edges + edge_index, is_own, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(first, seam, is_boundary)
+    return EdgeViews(first, seam, is_boundary)
 
 
-def contour_edges(batch: SurfaceBatch, planes) -> tuple:
-    """Lanes (view * E + edge) across which radiance may jump; per lane, whether the first face is front-facing, and whether both are."""
+def contour_edges(batch: SurfaceBatch, planes) -> tuple | None:
+    """Lanes (view * E + edge) across which radiance may jump; per lane, whether the first face is front-facing, and whether both are, at
+    a seam. None where there is no such edge.
+    """
     import drjit as dr
 
     mi = loaded_mitsuba()
-    tables = batch.tables
-    lane = dr.arange(mi.UInt32, batch.num_views * tables.num_edges)
-    view = lane // tables.num_edges
-    edge_index = lane - view * tables.num_edges
-    edge = dr.gather(mi.Vector4u, tables.edges, edge_index)
-    center = dr.gather(mi.Vector4f, batch.centers, view)
-    mesh = mi.UInt32(center.w)
-    base = mesh * tables.num_faces
-    is_open = edge.w == NO_FACE
-    first = dr.gather(mi.Vector4f, planes, base + edge.z)
-    second = dr.gather(mi.Vector4f, planes, base + edge.w, ~is_open)
-    is_front, is_second_front = _height(first, center) > 0, ~is_open & (_height(second, center) > 0)
-    is_front_seam = is_front & is_second_front & (edge_index < tables.num_seams)
-    is_convex = dr.gather(mi.Bool, convex_edges(batch, planes), mesh * tables.num_edges + edge_index)
-    is_boundary = is_open | (is_convex & (is_front != is_second_front)) | is_front_seam
-    dr.eval(is_boundary, is_front, is_front_seam)
-    kept = dr.compress(is_boundary)
-    return kept, dr.gather(mi.Bool, is_front, kept), dr.gather(mi.Bool, is_front_seam, kept)
+    num_edges = batch.tables.num_edges
+    views = edge_views(batch, planes)
+
+    def bit(bits, lane):
+        view = lane // num_edges
+        mesh = mi.UInt32(dr.gather(mi.Float, batch.centers, view * 4 + 3))
+        word = (view // VIEWS_PER_WORD * batch.scene.num_meshes + mesh) * num_edges + lane - view * num_edges
+        return (dr.gather(mi.UInt32, bits, word) >> (view % VIEWS_PER_WORD)) & 1 == 1
+
+    kept = dr.compress(views.is_boundary)
+    if len(kept) == 0:
+        return None
+    is_first_front, is_front_seam = bit(views.first_front, kept), bit(views.front_seam, kept)
+    dr.eval(kept, is_first_front, is_front_seam)
+    return kept, is_first_front, is_front_seam
 
 
 @dataclass(frozen=True)
@@ -157,9 +211,10 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
 
     mi = loaded_mitsuba()
     tables = batch.tables
-    kept, front, front_seam = contour_edges(batch, face_planes(batch))
-    if len(kept) == 0:
+    edges = contour_edges(batch, face_planes(batch))
+    if edges is None:
         return None
+    kept, front, front_seam = edges
     width, height = batch.film
     row, stratum, count = allot_samples(batch, kept, samples_per_edge)
     packed = dr.gather(mi.UInt32, kept, row)
@@ -261,7 +316,7 @@ def _background(batch: SurfaceBatch, view: View, view_index, position, depth, se
 
     mi = loaded_mitsuba()
     tables = batch.tables
-    limit = dr.gather(mi.Float, batch.boxes.depth_limit, view_index)
+    limit = dr.gather(mi.Float, batch.bounds.depth_limit, view_index)
     found = batch.scene.scene.ray_intersect_preliminary(view.ray(position, limit), coherent=False, active=active)
     face = found.prim_index - view.mesh * tables.num_faces
     is_hit = active & found.is_valid() & (face < tables.num_faces)
@@ -284,3 +339,7 @@ def _vertex(vertices, index):
 def _height(plane, point):
     """Signed height of a point over a plane (both packets), scaled by the normal's length."""
     return plane.x * point.x + plane.y * point.y + plane.z * point.z - plane.w
+
+
+def _num_words(batch: SurfaceBatch) -> int:
+    return -(-batch.num_views // VIEWS_PER_WORD)

@@ -63,7 +63,7 @@ def scatter_image(batch: SurfaceBatch, hits: Hits, radiance, image, mask) -> Non
     targets = [(image, first + channel * plane, radiance[channel]) for channel in range(3)]
     for target, index, value in (*targets, (mask, hits.pixel, mi.Float(1.0))):
         if batch.samples_per_pixel == 1:  # no two lanes share a pixel
-            dr.scatter(target, value, index)
+            dr.scatter(target, value, index, mode=dr.ReduceMode.NoConflicts)  # otherwise each scatter to one image is a kernel
         else:
             dr.scatter_add(target, value * (1.0 / batch.samples_per_pixel), index)
 

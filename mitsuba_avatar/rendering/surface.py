@@ -145,7 +145,7 @@ class SurfaceRenderer:
         tables = [mi.TensorXf(table) for table in (placement.scene_vertices, placement.offset, placement.views, placement.centers)]
         batch = self.batch(mi.TensorXf(textures.detach().contiguous()), len(vertices), tuple(tables), seed)
         batch.scene.update(tables[0].array)
-        batch.boxes = visibility.bound_views(batch)
+        batch.bounds = visibility.bound_views(batch)
         hits = visibility.trace_views(batch)
         radiance, mask = dr.zeros(mi.Float, batch.num_pixels * 4), dr.zeros(mi.Float, batch.num_pixels)
         if hits is not None:
@@ -273,7 +273,7 @@ def _make_operation():
             self.scene_vertices = tables[0].array  # `vertices` itself only receives the gradient
             self.batch.scene.update(self.scene_vertices)
             self.version = self.batch.scene.version
-            self.batch.boxes = visibility.bound_views(self.batch)
+            self.batch.bounds = visibility.bound_views(self.batch)
             self.hits = visibility.trace_views(self.batch)
             batch, (width, height) = self.batch, renderer.film
             radiance, mask = dr.zeros(mi.Float, batch.num_pixels * 3), dr.zeros(mi.Float, batch.num_pixels)
@@ -282,7 +282,7 @@ def _make_operation():
                 shading.scatter_image(batch, self.hits, shading.shade(batch, self.hits), radiance, mask)
                 if call.has_layers:
                     scatter_layers(batch, self.hits, layers)
-            dr.eval(radiance, mask, layers)
+            dr.eval(radiance, mask, layers, self.hits.columns() if self.hits is not None else [])
             return (
                 mi.TensorXf(radiance, (batch.num_views, 3, height, width)),
                 mi.TensorXf(mask, (batch.num_views, 1, height, width)),

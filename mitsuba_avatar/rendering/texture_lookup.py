@@ -98,5 +98,5 @@ def planar_texels(packets, shape: tuple[int, int, int, int]):
     packet = dr.gather(mi.Vector4f, packets, lane)
     flat = dr.empty(mi.Float, count * size * 3)
     for channel in range(3):
-        dr.scatter(flat, packet[channel], first + channel * size)
+        dr.scatter(flat, packet[channel], first + channel * size, mode=dr.ReduceMode.NoConflicts)  # one kernel
     return flat

@@ -1,18 +1,17 @@
 """Primary visibility: which face, and where on it, every sample of every pixel of every view sees. One launch for all views.
 
-Only pixels that the mesh can cover are traced: each view's projected vertices bound a box, boxes are cut into 4x4-pixel tiles, and a
-lane is one sample of one pixel of a tile, so that neighbouring lanes trace neighbouring rays.
+Only pixels that the mesh can cover are traced: the projected faces mark 4x4-pixel tiles, and a lane is one sample of one pixel of a
+marked tile, so that neighbouring lanes trace neighbouring rays.
 """
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
-from mitsuba_avatar.rendering.batch import Boxes, SurfaceBatch
+from mitsuba_avatar.rendering.batch import SurfaceBatch, ViewBounds
 from mitsuba_avatar.rendering.views import NEAR, View
 
 TILE = 4  # pixels on a side
+ROUNDING = 0.02  # pixels by which the projection of a vertex and the ray towards it may disagree, and more
 TEA_ROUNDS = 6  # fewer rounds leave correlations that bias gradients by tens of per cent (measured with 3)
 
 
@@ -38,9 +37,13 @@ class Hits:
     barycentric: object
     depth: object
 
+    def columns(self) -> list:
+        """The arrays, to evaluate them together with what is computed from them."""
+        return [self.pixel, self.view, self.sample, self.face, self.barycentric, self.depth]
 
-def bound_views(batch: SurfaceBatch) -> Boxes:
-    """Boxes of the projected vertices, one per view, clipped to the film."""
+
+def bound_views(batch: SurfaceBatch) -> ViewBounds:
+    """Tiles that the faces of each view's mesh may cover, and its farthest depth."""
     import drjit as dr
 
     mi = loaded_mitsuba()
@@ -51,37 +54,50 @@ def bound_views(batch: SurfaceBatch) -> Boxes:
     vertex = dr.gather(mi.Vector4f, batch.vertices, view.mesh * num_vertices + lane % num_vertices)
     point = view.to_camera(mi.Vector3f(vertex.x, vertex.y, vertex.z))
     pixel = view.project(point)
-    is_in_front = point.z > NEAR
+    pixels = dr.empty(mi.Float, len(lane) * 2)
+    behind = dr.select(point.z > NEAR, 0.0, dr.inf)
+    dr.scatter(pixels, mi.Point2f(pixel.x + behind, pixel.y), lane, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(pixels, point.z)  # in one kernel; a reduction evaluates its argument by itself
+    nearest = dr.block_reduce(dr.ReduceOp.Min, point.z, num_vertices)
+    farthest = dr.block_reduce(dr.ReduceOp.Max, point.z, num_vertices)
+
     width, height = batch.film
+    across, down = -(-width // TILE), -(-height // TILE)
     # A vertex behind the camera bounds nothing: its view traces the whole film.
-    low_x, low_y = dr.select(is_in_front, pixel.x, 0.0), dr.select(is_in_front, pixel.y, 0.0)
-    high_x, high_y = dr.select(is_in_front, pixel.x, float(width)), dr.select(is_in_front, pixel.y, float(height))
-    dr.eval(low_x, low_y, high_x, high_y, point.z)  # in one kernel; a reduction evaluates its argument by itself
-    lows = [dr.block_reduce(dr.ReduceOp.Min, column, num_vertices) for column in (low_x, low_y)]
-    highs = [dr.block_reduce(dr.ReduceOp.Max, column, num_vertices) for column in (high_x, high_y, point.z)]
-    columns = lows + highs
-    dr.eval(columns)
-    left, top, right, bottom, depth = (np.asarray(column.numpy(), np.float64) for column in columns)
-    first_x = np.clip(np.floor(left / TILE), 0, -(-width // TILE)).astype(int)
-    first_y = np.clip(np.floor(top / TILE), 0, -(-height // TILE)).astype(int)
-    last_x = np.clip(np.floor(right / TILE) + 1, 0, -(-width // TILE)).astype(int)
-    last_y = np.clip(np.floor(bottom / TILE) + 1, 0, -(-height // TILE)).astype(int)
-    across, down = np.maximum(last_x - first_x, 0), np.maximum(last_y - first_y, 0)
-    count = np.where(depth > NEAR, across * down, 0)
-    start = np.cumsum(count) - count
+    view_index = dr.arange(mi.UInt32, batch.num_views * across * down) // (across * down)
+    is_touched = (dr.gather(mi.Float, nearest, view_index) <= NEAR) & (dr.gather(mi.Float, farthest, view_index) > NEAR)
+    dr.eval(is_touched)
+    _mark_tiles(batch, pixels, is_touched)
+    return ViewBounds(tiles=dr.compress(is_touched), depth_limit=farthest * 1.001 + 0.01)
 
-    # Python lists, not numpy arrays: Dr.Jit compiles a new kernel when the alignment of a borrowed numpy buffer changes.
-    def column(values, kind=mi.UInt32):
-        return dr.opaque(kind, values[0]) if len(values) == 1 else kind(values)
 
-    return Boxes(
-        tile_x=column(first_x.tolist()),
-        tile_y=column(first_y.tolist()),
-        tiles_per_row=column(np.maximum(across, 1).tolist()),  # at least 1: lanes that pad a launch divide by it too
-        start=column(start.tolist()),
-        depth_limit=column((depth * 1.001 + 0.01).tolist(), mi.Float),
-        num_tiles=int(count.sum()),
-    )
+def _mark_tiles(batch: SurfaceBatch, pixels, is_touched) -> None:
+    """Set the tiles [B * tiles of a film] under the bounding box of each face; pixels [B * V, 2], infinite behind the camera."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    num_faces, num_vertices = batch.tables.num_faces, batch.num_vertices
+    lane = dr.arange(mi.UInt32, batch.num_views * num_faces)
+    view_index = lane // num_faces
+    corners = dr.gather(mi.Vector4u, batch.tables.faces, lane - view_index * num_faces)
+    a, b, c = (dr.gather(mi.Point2f, pixels, view_index * num_vertices + corner) for corner in (corners.x, corners.y, corners.z))
+    low, high = dr.minimum(dr.minimum(a, b), c) - ROUNDING, dr.maximum(dr.maximum(a, b), c) + ROUNDING
+    width, height = batch.film
+    across, down = -(-width // TILE), -(-height // TILE)
+    is_inside = (high.x >= 0) & (high.y >= 0) & (low.x < width) & (low.y < height) & (high.x < dr.inf)
+    first_x, first_y = mi.UInt32(dr.maximum(low.x, 0.0)) // TILE, mi.UInt32(dr.maximum(low.y, 0.0)) // TILE
+    last_x = mi.UInt32(dr.clip(high.x, 0.0, width - 1.0)) // TILE
+    last_y = mi.UInt32(dr.clip(high.y, 0.0, height - 1.0)) // TILE
+    start = view_index * (across * down)
+
+    def mark(x, y):
+        dr.scatter(is_touched, mi.Bool(True), start + y * across + x, mode=dr.ReduceMode.NoConflicts)
+        is_row_done = x >= last_x
+        return dr.select(is_row_done, first_x, x + 1), dr.select(is_row_done, y + 1, y)
+
+    first = dr.select(is_inside, first_y, last_y + 1)
+    dr.while_loop(state=(first_x, first), cond=lambda x, y: y <= last_y, body=mark, labels=("x", "y"))
+    dr.eval(is_touched)
 
 
 def jitter(pixel, sample, seed, samples_per_pixel: int):
@@ -106,39 +122,50 @@ def golden_lattice(index, count: int, shift):
 
 
 def trace_views(batch: SurfaceBatch) -> Hits | None:
-    """Trace all samples of all tiles and keep those that hit their own mesh; None when nothing is hit."""
+    """Trace all samples of all tiles and keep those that hit their own mesh; None when nothing is hit. The result is not evaluated."""
     import drjit as dr
 
-    boxes, num_faces, samples_per_pixel = batch.boxes, batch.tables.num_faces, batch.samples_per_pixel
-    if boxes.num_tiles == 0:
+    bounds, num_faces = batch.bounds, batch.tables.num_faces
+    if len(bounds.tiles) == 0:
         return None
     mi = loaded_mitsuba()
-    width, height = batch.film
-    lanes_per_tile = TILE * TILE * samples_per_pixel
-    lane = dr.arange(mi.UInt32, boxes.num_tiles * lanes_per_tile)
-    tile, within = lane // lanes_per_tile, lane % lanes_per_tile
-    sample, within = within // (TILE * TILE), within % (TILE * TILE)
-    view_index = dr.zeros(mi.UInt32, len(lane))  # a single view leaves nothing to search
-    if batch.num_views > 1:
-        view_index = dr.binary_search(0, batch.num_views - 1, lambda i: dr.gather(mi.UInt32, boxes.start, i + 1) <= tile)
-    local = tile - dr.gather(mi.UInt32, boxes.start, view_index)
-    per_row = dr.maximum(dr.gather(mi.UInt32, boxes.tiles_per_row, view_index), 1)
-    row = local // per_row
-    x = (dr.gather(mi.UInt32, boxes.tile_x, view_index) + local - row * per_row) * TILE + within % TILE
-    y = (dr.gather(mi.UInt32, boxes.tile_y, view_index) + row) * TILE + within // TILE
-    active = (x < width) & (y < height)
-    pixel = (view_index * height + y) * width + x
-    position = mi.Point2f(x, y) + jitter(pixel, sample, batch.seed, samples_per_pixel)
+    lane = dr.arange(mi.UInt32, len(bounds.tiles) * TILE * TILE * batch.samples_per_pixel)
+    pixel, view_index, sample, x, y = _pixel_of_lane(batch, lane)
     view = View.gather(batch.views, view_index)
-    ray = view.ray(position, dr.gather(mi.Float, boxes.depth_limit, view_index))
+    position = mi.Point2f(x, y) + jitter(pixel, sample, batch.seed, batch.samples_per_pixel)
+    ray = view.ray(position, dr.gather(mi.Float, bounds.depth_limit, view_index))
+    active = (x < batch.film[0]) & (y < batch.film[1])
     found = batch.scene.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    prim_index = found.prim_index
-    is_hit = active & found.is_valid() & (prim_index // num_faces == view.mesh)
-    columns = [pixel, view_index, sample, prim_index - view.mesh * num_faces, found.prim_uv.x, found.prim_uv.y, found.t]
-    dr.eval(columns, is_hit)
+    face = found.prim_index - view.mesh * num_faces
+    is_hit = active & found.is_valid() & (face < num_faces)
+    # One packet a hit: compaction then reads one cache line instead of four.
+    packets = dr.empty(mi.Float, len(lane) * 4)
+    packet = mi.Vector4f(found.prim_uv.x, found.prim_uv.y, found.t, dr.reinterpret_array(mi.Float, face))
+    dr.scatter(packets, packet, lane, is_hit, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(packets, is_hit)
     kept = dr.compress(is_hit)
     if len(kept) == 0:
         return None
-    pixel, view_index, sample, face, b1, b2, depth = [dr.gather(type(column), column, kept) for column in columns]
-    dr.eval(pixel, view_index, sample, face, b1, b2, depth)
-    return Hits(len(kept), pixel, view_index, sample, face, mi.Point2f(b1, b2), depth)
+    pixel, view_index, sample, _, _ = _pixel_of_lane(batch, kept)
+    packet = dr.gather(mi.Vector4f, packets, kept)
+    return Hits(len(kept), pixel, view_index, sample, dr.reinterpret_array(mi.UInt32, packet.w), mi.Point2f(packet.x, packet.y), packet.z)
+
+
+def _pixel_of_lane(batch: SurfaceBatch, lane) -> tuple:
+    """Index of a lane's pixel among all of the batch, its view, its sample, and the pixel's x and y."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    width, height = batch.film
+    across, down = -(-width // TILE), -(-height // TILE)
+    per_tile = TILE * TILE * batch.samples_per_pixel
+    marked = lane // per_tile
+    within = lane - marked * per_tile
+    sample, within = within // (TILE * TILE), within % (TILE * TILE)
+    tile = dr.gather(mi.UInt32, batch.bounds.tiles, marked)
+    view_index = tile // (across * down)
+    tile -= view_index * (across * down)
+    row = tile // across
+    x = (tile - row * across) * TILE + within % TILE
+    y = row * TILE + within // TILE
+    return (view_index * height + y) * width + x, view_index, sample, x, y
