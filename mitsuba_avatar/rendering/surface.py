@@ -83,6 +83,7 @@ class SurfaceRenderer:
         cameras: CameraBatch,
         mesh_index: Int[Tensor, " B"] | None = None,
         seed: int = 0,
+        background: Float[Tensor, "..."] | None = None,
     ) -> tuple[Float[Tensor, "B 3 H W"], Float[Tensor, "B 1 H W"]]:
         """Draw B views, each of one of P meshes.
 
@@ -92,13 +93,14 @@ class SurfaceRenderer:
             cameras: B cameras.
             mesh_index: [B] which mesh each view shows; by default B / P consecutive views share a mesh.
             seed: pixel jitter and boundary samples derive from it, decorrelated; equal seeds give equal images.
+            background: linear radiance behind the surface: [3] one colour, [B, 3] one a view, or plates [B, 3, H, W]. None is black.
 
         Returns:
-            radiance [B, 3, H, W], premultiplied by coverage (add `(1 - mask) * background` to composite), and mask [B, 1, H, W], the
-            share of each pixel that the surface covers.
+            radiance [B, 3, H, W] over the background (over black it is premultiplied by coverage), and mask [B, 1, H, W], the share of
+            each pixel that the surface covers.
 
-        Gradients: flow to vertices (shading and silhouettes, for radiance and mask) and textures; cameras are constants. One backward
-        pass per render: combine the losses first.
+        Gradients: flow to vertices (shading and silhouettes, for radiance and mask), textures and background; cameras are constants.
+        One backward pass per render: combine the losses first.
 
         Raises:
             ValueError: shapes that do not match the topology or each other; vertices or cameras that are not finite. What textures
@@ -106,7 +108,7 @@ class SurfaceRenderer:
             TypeError: another element type than float32.
         """
         radiance, mask, _ = self._draw(vertices, textures, cameras, mesh_index, self._call(vertices, textures, seed, has_layers=False))
-        return radiance, mask
+        return (radiance, mask) if background is None else (_over(background, radiance, mask), mask)
 
     def render_layers(
         self,
@@ -256,6 +258,18 @@ class Call:
 
     def __init__(self, seed: int, has_layers: bool, moves_vertices: bool, moves_textures: bool):
         self.seed, self.has_layers, self.moves_vertices, self.moves_textures = seed, has_layers, moves_vertices, moves_textures
+
+
+def _over(background: Tensor, radiance: Float[Tensor, "B 3 H W"], mask: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B 3 H W"]:
+    """Premultiplied radiance over a background of one of the shapes that `render` takes."""
+    count, _, height, width = radiance.shape
+    if tuple(background.shape) not in ((3,), (count, 3), (count, 3, height, width)):
+        raise ValueError(
+            f"render(): background must be [3], [{count}, 3] or [{count}, 3, {height}, {width}] for these views; got "
+            f"{list(background.shape)}. Resize or crop plates as the film."
+        )
+    plates = background if background.ndim == 4 else background[..., None, None]
+    return radiance + (1 - mask) * plates.to(radiance)
 
 
 def _make_operation():

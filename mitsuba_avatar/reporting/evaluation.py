@@ -67,8 +67,8 @@ class Evaluator:
         else:
             vertices = avatar.pose_template(batch.theta, batch.root)
             textures = avatar.mean_texture.expand(len(batch.cameras), -1, -1, -1)
-        radiance, masks = self.renderer.render(vertices, textures, batch.cameras, seed=batch.frames[0])
-        images = encode(radiance + (1 - masks) * batch.backgrounds, "srgb")
+        radiance, masks = self.renderer.render(vertices, textures, batch.cameras, seed=batch.frames[0], background=batch.backgrounds)
+        images = encode(radiance, "srgb")
         return Drawn(images.clamp(0, 1).cpu(), masks.cpu(), vertices[0].cpu())
 
     def measure(

@@ -54,6 +54,39 @@ def test_one_sample_a_pixel_is_right_on_average():
     assert float((difference > 4 * error + 0.02).float().mean()) < 0.005
 
 
+def test_a_background_shows_where_the_surface_does_not():
+    """One colour, one a view, plates: each pixel is the premultiplied image plus the uncovered share of what lies behind."""
+    vertices, topology = meshes.sphere(1)
+    cameras, textures = meshes.orbit(2, *FILM), meshes.waves(2, 16, 20)
+    renderer = SurfaceRenderer(topology, *FILM, samples_per_pixel=4)
+    premultiplied, mask = renderer.render(to_torch(vertices)[None], textures, cameras)
+    plates = torch.rand(2, 3, 22, 30, generator=torch.Generator().manual_seed(0))
+    for background in (plates, plates[:, :, 3, 5], plates[0, :, 3, 5]):
+        image, same_mask = renderer.render(to_torch(vertices)[None], textures, cameras, background=background)
+        behind = background if background.ndim == 4 else background.reshape(-1, 3, 1, 1).expand(2, -1, 22, 30)
+        assert torch.equal(mask, same_mask)
+        for y, x in ((0, 0), (11, 15), (9, 8)):
+            expected = premultiplied[:, :, y, x] + (1 - mask[:, :, y, x]) * behind[:, :, y, x]
+            torch.testing.assert_close(image[:, :, y, x], expected)
+    for wrong in (plates[:1], plates[:, :, :, :-1], plates[..., 0, 0, 0]):
+        with pytest.raises(ValueError, match=r"background must be \[3\], \[2, 3\] or \[2, 3, 22, 30\]"):
+            renderer.render(to_torch(vertices)[None], textures, cameras, background=wrong)
+
+
+def test_silhouettes_feel_the_background():
+    """Over a background of the surface's own colour nothing changes where the surface moves: the vertex gradient is zero."""
+    vertices, topology = meshes.sphere(1)
+    cameras, textures = meshes.orbit(2, *FILM), torch.full((2, 3, 4, 6), 0.5)
+    renderer = SurfaceRenderer(topology, *FILM, samples_per_pixel=4, boundary_samples_per_edge=4)
+    gradients = []
+    for behind in (0.0, 0.5):
+        moved = to_torch(vertices)[None].requires_grad_()
+        image, _ = renderer.render(moved, textures, cameras, background=torch.full((3,), behind))
+        weights = torch.linspace(0, 1, 30) * torch.linspace(1, 2, 22)[:, None]
+        gradients.append(torch.autograd.grad((image * weights).sum(), moved)[0].abs().sum())
+    assert gradients[1] < 1e-3 * gradients[0]
+
+
 def test_equal_seeds_give_equal_images_and_others_do_not():
     vertices, topology = meshes.sphere(1)
     cameras, textures = meshes.orbit(2, *FILM), meshes.waves(2, 16, 20)

@@ -1,0 +1,278 @@
+"""How far latent code and driving signal of a trained avatar are apart: the measures behind the claim, as functions of plain tensors.
+
+None of them reads a file or draws a picture. Pairs of frames are made by the caller (`other_frames` makes a fair choice), so that a measure
+can be repeated on the same ones for another avatar. Distances in millimetres, information in nats.
+
+Symbols: N frames, Z latent size, D entries of the driving signal, V vertices, T entries of a target state.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.model.disentanglement import StatisticsNetwork, corrected_objective, mismatched, mutual_information_bound
+from mitsuba_avatar.model.encoder import Posterior
+from mitsuba_avatar.model.keypoints import DrivenKeypoints
+
+MILLIMETRES = 1000.0  # in a metre
+ACTIVE_VARIANCE = 0.01  # of an entry's posterior mean over the frames; below it the entry says nothing (Burda et al., arXiv:1509.00519)
+
+WIDTH, PAIRS, MISMATCHES, RATE = 128, 256, 2, 0.05  # of a fresh estimator: hidden features, mini-batch, shuffles of it, moving average
+LEARNING_RATE = 1e-3
+CHECK_EVERY = 25  # steps between looks at the validation frames
+JUDGED_MISMATCHES = 32  # shuffles of the frames that an estimator is judged on
+DECODED_AT_ONCE = 8  # frames
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Driving signals of N frames.
+
+    Attributes:
+        theta: [N, D] radians. root: [N, 4, 4]. face: [N, F].
+    """
+
+    theta: Float[Tensor, "N D"]
+    root: Float[Tensor, "N 4 4"]
+    face: Float[Tensor, "N F"]
+
+    def rows(self, rows: slice | Int[Tensor, "M"]) -> "Drive":
+        """The signals of some frames."""
+        return Drive(self.theta[rows], self.root[rows], self.face[rows])
+
+
+@dataclass(frozen=True)
+class LatentUse:
+    """How much an encoder says: nats per frame, and how many entries of z say anything."""
+
+    kl_nats: float
+    active_entries: int
+
+
+@dataclass(frozen=True)
+class SwapDistances:
+    """How far a swap of latent codes, or of driving signals, moves the surface from where it should be, mean in millimetres.
+
+    Attributes:
+        body_keypoints_mm: joints as the skin around them shows them.
+        face_landmarks_mm: None where the face signal does not list landmarks.
+        vertices_mm: name of a group of vertices ("all", "shirt") -> mean over it.
+    """
+
+    body_keypoints_mm: float
+    face_landmarks_mm: float | None
+    vertices_mm: dict[str, float]
+
+
+def latent_use(posterior: Posterior) -> LatentUse:
+    """KL divergence from the prior, mean over frames, and the number of entries whose posterior mean varies between frames."""
+    mu, logvar = posterior.mu.double(), posterior.logvar.double()
+    nats = 0.5 * (mu.square() + logvar.exp() - 1 - logvar).sum(1).mean()
+    active = (mu.var(0, correction=0) > ACTIVE_VARIANCE).sum()
+    return LatentUse(float(nats), int(active))
+
+
+def fresh_mutual_information(
+    posterior: Posterior, driving: Float[Tensor, "N D"], blocks: int = 8, steps: int = 600, seed: int = 0
+) -> float:
+    """Mutual information between z ~ posterior and the driving signal, nats, by estimators trained from nothing.
+
+    The frames are cut into contiguous blocks, because neighbours resemble each other. One quarter of the blocks judges, one decides when
+    training stops, the rest trains; each quarter judges once, and the mean is reported. Judged on frames that it has not seen, the bound
+    cannot be raised by memorising; it is low where frames are few.
+
+    Args:
+        posterior: of N frames in order of time; a fresh z is drawn from it at every step.
+        driving: [N, D] standardised (`Avatar.standardized_driving`).
+        blocks: a multiple of 4.
+        steps: of each of the four trainings.
+        seed: of initial weights and draws.
+
+    Raises:
+        ValueError: fewer than four frames a block, or blocks is no multiple of 4.
+    """
+    count = len(driving)
+    if blocks < 4 or blocks % 4 or count < 4 * blocks:
+        raise ValueError(
+            f"fresh_mutual_information(): expected blocks to be a multiple of 4 with at least 4 frames each; got {blocks} blocks of "
+            f"{count} frames. Use more frames or fewer blocks."
+        )
+    quarter = (torch.arange(count) * blocks // count) % 4
+    bounds = []
+    for judge in range(4):
+        is_judge, is_stop = quarter == judge, quarter == (judge + 1) % 4
+        groups = [torch.nonzero(group)[:, 0] for group in (~(is_judge | is_stop), is_stop, is_judge)]
+        bounds.append(_judged_bound(posterior, driving, groups, steps, seed + judge))
+    return max(float(np.mean(bounds)), 0.0)
+
+
+def linear_probe(
+    z: Float[np.ndarray, "N Z"],
+    target: Float[np.ndarray, "N T"],
+    held_out_z: Float[np.ndarray, "M Z"],
+    held_out_target: Float[np.ndarray, "M T"],
+    strengths: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0, 10.0),
+) -> float:
+    """How much of a state a ridge regression reads off z: R^2 on held-out frames; 1 all of it, 0 no more than the mean.
+
+    Args:
+        z, target: of frames in order of time; the last quarter of them chooses the strength of the ridge.
+        held_out_z, held_out_target: of frames that judge.
+        strengths: candidates, per frame and in units of the variance of an entry of z.
+
+    Returns:
+        1 - squared error / squared deviation from the mean of the held-out target, over all its entries; can be negative.
+
+    Raises:
+        ValueError: if the held-out target does not vary.
+    """
+    cut = 3 * len(z) // 4
+    choices = [_ridge_score(z[:cut], target[:cut], z[cut:], target[cut:], strength) for strength in strengths]
+    best = strengths[int(np.argmax(choices))]
+    return _ridge_score(z, target, held_out_z, held_out_target, best)
+
+
+def other_frames(driving: Float[Tensor, "N D"], seed: int = 0, farther_than: float = 0.5) -> Int[Tensor, "N"]:
+    """For each frame another one at random, whose driving signal is at least as far away as the share `farther_than` of all frames.
+
+    Neighbours in time have nearly the same pose and code: swapping them would prove nothing.
+    """
+    distance = torch.cdist(driving.double(), driving.double())
+    cut = torch.quantile(distance, farther_than, dim=1, keepdim=True)
+    is_far = (distance >= cut) & ~torch.eye(len(driving), dtype=torch.bool)
+    return torch.multinomial(is_far.double().cpu(), 1, generator=torch.Generator().manual_seed(seed))[:, 0]
+
+
+def latent_swap(
+    avatar: Avatar,
+    keypoints: DrivenKeypoints,
+    drive: Drive,
+    z: Float[Tensor, "N Z"],
+    other_z: Float[Tensor, "N Z"],
+    vertex_groups: Mapping[str, Bool[np.ndarray, "V"]] | None = None,
+) -> SwapDistances:
+    """Same driving signal, other latent code: how far the surface moves.
+
+    Keypoints should not move, since the driving signal fixes them; clothes should, since the latent code is theirs.
+
+    Args:
+        avatar: with a latent code.
+        keypoints: of its rig.
+        drive: N frames.
+        z: their codes. other_z: codes of other frames, or draws from the prior.
+        vertex_groups: masks to report apart from "all".
+    """
+    distances = []
+    with torch.no_grad():
+        for rows in _portions(len(z)):
+            part = drive.rows(rows)
+            both = [avatar.decode_rest_vertices(part.theta, part.face, codes[rows]) for codes in (z, other_z)]
+            shown = [keypoints.from_surface(rest, part.theta, part.root) for rest in both]
+            # A pose turns both surfaces alike but for blended joints: distances in rest space are those in the world.
+            distances.append(((shown[1] - shown[0]).norm(dim=-1), (both[1] - both[0]).norm(dim=-1)))
+    return _swap_distances(distances, keypoints, vertex_groups)
+
+
+def drive_swap(
+    avatar: Avatar,
+    keypoints: DrivenKeypoints,
+    other_drive: Drive,
+    z: Float[Tensor, "N Z"],
+    vertex_groups: Mapping[str, Bool[np.ndarray, "V"]] | None = None,
+) -> SwapDistances:
+    """Same latent code, other driving signal: how far the surface is from what that signal asks for.
+
+    Keypoints are compared with those of the driving signal itself, vertices with the surface under the most likely code z = 0. A code that
+    carries its own frame's pose drags both towards that pose.
+
+    Args:
+        avatar: with a latent code.
+        keypoints: of its rig.
+        other_drive: N frames.
+        z: codes of N others (`other_frames`).
+        vertex_groups: masks to report apart from "all".
+    """
+    distances = []
+    with torch.no_grad():
+        for rows in _portions(len(z)):
+            part = other_drive.rows(rows)
+            rest = avatar.decode_rest_vertices(part.theta, part.face, z[rows])
+            neutral = avatar.decode_rest_vertices(part.theta, part.face, None)
+            asked = keypoints.from_driving(part.theta, part.root, part.face)
+            shown = keypoints.from_surface(rest, part.theta, part.root)
+            distances.append(((shown - asked).norm(dim=-1), (rest - neutral).norm(dim=-1)))
+    return _swap_distances(distances, keypoints, vertex_groups)
+
+
+def _judged_bound(posterior: Posterior, driving: Tensor, groups: list[Tensor], steps: int, seed: int) -> float:
+    """The bound on the judging frames of an estimator that was trained, and stopped, on others."""
+    train, stop, judge = groups
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = StatisticsNetwork(posterior.mu.shape[1], driving.shape[1], WIDTH)
+    network.to(driving.device).standardize_by(_draw(posterior, train, generator), driving[train])
+    optimizer = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE, fused=True)
+    mean_exp, best, judged = 1.0, 0.0, 0.0  # the untrained network's bound is 0, on every frame
+    for step in range(1, steps + 1):
+        rows = train[torch.randint(len(train), (min(PAIRS, len(train)),), generator=generator)]
+        z = _draw(posterior, rows, generator)
+        joint, product = network(z, driving[rows]), network(z[None], mismatched(driving[rows], MISMATCHES, generator))
+        mean_exp = (1 - RATE) * mean_exp + RATE * float(product.detach().exp().mean())
+        optimizer.zero_grad(set_to_none=True)
+        (-corrected_objective(joint, product, mean_exp)).backward()
+        optimizer.step()
+        if step % CHECK_EVERY == 0:
+            bound = _bound(network, posterior, driving, stop, generator)
+            if bound > best:
+                best, judged = bound, _bound(network, posterior, driving, judge, generator)
+    return judged
+
+
+def _bound(network: StatisticsNetwork, posterior: Posterior, driving: Tensor, rows: Tensor, generator: torch.Generator) -> float:
+    with torch.no_grad():
+        z = _draw(posterior, rows, generator)
+        others = mismatched(driving[rows], min(JUDGED_MISMATCHES, len(rows) - 1), generator)
+        return float(mutual_information_bound(network(z, driving[rows]), network(z[None], others)))
+
+
+def _draw(posterior: Posterior, rows: Tensor, generator: torch.Generator) -> Tensor:
+    """z of some frames."""
+    mu, logvar = posterior.mu[rows], posterior.logvar[rows]
+    return Posterior(mu, logvar).sample(torch.randn(mu.shape, generator=generator).to(mu))
+
+
+def _ridge_score(z: np.ndarray, target: np.ndarray, held_out_z: np.ndarray, held_out_target: np.ndarray, strength: float) -> float:
+    mean, target_mean = z.mean(0), target.mean(0)
+    centred = (z - mean).astype(np.float64)
+    gram = centred.T @ centred / len(z)
+    gram += strength * max(np.trace(gram) / len(gram), np.finfo(np.float64).tiny) * np.eye(len(gram))
+    weights = np.linalg.solve(gram, centred.T @ (target - target_mean) / len(z))
+    error = held_out_target - target_mean - (held_out_z - mean) @ weights
+    deviation = float(np.square(held_out_target - held_out_target.mean(0)).sum())
+    if deviation == 0:
+        raise ValueError("linear_probe(): expected a target that varies over the frames that judge; got a constant. Choose other frames.")
+    return 1 - float(np.square(error).sum()) / deviation
+
+
+def _portions(count: int) -> list[slice]:
+    return [slice(start, start + DECODED_AT_ONCE) for start in range(0, count, DECODED_AT_ONCE)]
+
+
+def _swap_distances(
+    distances: list[tuple[Tensor, Tensor]], keypoints: DrivenKeypoints, vertex_groups: Mapping[str, np.ndarray] | None
+) -> SwapDistances:
+    """Means of (keypoint, vertex) distances in metres, by group."""
+    of_keypoints = MILLIMETRES * torch.cat([pair[0] for pair in distances]).double()  # [N, K]
+    of_vertices = MILLIMETRES * torch.cat([pair[1] for pair in distances]).double().mean(0)  # [V]
+    groups = {name: torch.from_numpy(mask).to(of_vertices.device) for name, mask in (vertex_groups or {}).items()}
+    return SwapDistances(
+        body_keypoints_mm=float(of_keypoints[:, : keypoints.num_body].mean()),
+        face_landmarks_mm=float(of_keypoints[:, keypoints.num_body :].mean()) if keypoints.with_face else None,
+        vertices_mm={"all": float(of_vertices.mean())} | {name: float(of_vertices[mask].mean()) for name, mask in groups.items()},
+    )
