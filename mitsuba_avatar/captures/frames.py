@@ -1,4 +1,4 @@
-"""frames.csv: which moments a capture holds, and which of them train and which test.
+"""frames.csv: which moments a capture holds, and which of them train, validate and test.
 
 A frame's *number* names its image files; its *index* is its row here and in every array of the capture. The two differ wherever a
 capture starts late or skips frames.
@@ -14,6 +14,7 @@ from typing import Literal
 from mitsuba_avatar.files import atomic_path
 
 COLUMNS = ("frame", "time", "split", "segment")
+SPLITS = ("train", "validation", "test")
 
 
 @dataclass(frozen=True)
@@ -23,19 +24,21 @@ class Frame:
     Attributes:
         number: names the image files, `images/<camera>/<number:06d>.<extension>`.
         time: seconds from the capture's start.
-        split: whether it may be learnt from.
+        split: "train" may be learnt from; "validation" is held out within the training takes, to choose settings by; "test" is for
+            reporting alone.
         segment: the take it belongs to, "range_of_motion" say; frames of one segment follow each other in time.
     """
 
     number: int
     time: float
-    split: Literal["train", "test"]
+    split: Literal["train", "validation", "test"]
     segment: str
 
     def __post_init__(self) -> None:
-        if self.number < 0 or self.split not in ("train", "test"):
+        if self.number < 0 or self.split not in SPLITS:
             raise ValueError(
-                f"Frame(): expected a number >= 0 and the split 'train' or 'test'; got {self.number} and {self.split!r}. Correct the frame."
+                f"Frame(): expected a number >= 0 and a split of {', '.join(SPLITS)}; got {self.number} and {self.split!r}. "
+                "Correct the frame."
             )
 
 
@@ -90,7 +93,7 @@ def _frame_from_row(path: Path, line: int, row: dict[str, str]) -> Frame:
     except (AttributeError, TypeError, ValueError) as error:
         values = [row[column] for column in COLUMNS]
         raise ValueError(
-            f"load_frames(): expected 'number,seconds,train|test,segment' in line {line} of {path}; got {values}. Correct the line."
+            f"load_frames(): expected 'number,seconds,{'|'.join(SPLITS)},segment' in line {line} of {path}; got {values}. Correct the line."
         ) from error
 
 

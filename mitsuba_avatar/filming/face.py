@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+FULL_GAZE = 0.5  # radians by which an eye at full strength of a look has turned
 BLINK = 0.32  # seconds from open to open
 EXPRESSIONS = (
     {"mouthSmileLeft": 0.8, "mouthSmileRight": 0.8, "cheekSquintLeft": 0.5, "cheekSquintRight": 0.5},
@@ -63,6 +64,21 @@ def expression_tour(time: Float[np.ndarray, "N"], names: Sequence[str], rng: np.
         for name, strength in EXPRESSIONS[index].items():
             _add(actions, names, name, strength * envelope)
     return _with_blinks(np.clip(actions, 0, 1), time, names, rng)
+
+
+def gaze_of_actions(actions: Float[np.ndarray, "N A"], names: Sequence[str]) -> Float[np.ndarray, "N 2 2"]:
+    """Where facial actions have the eyes look: [N, left and right eye, elevation and turn to the person's left], radians."""
+
+    def strength(name: str) -> np.ndarray:
+        return actions[:, list(names).index(name)] if name in names else np.zeros(len(actions))
+
+    left, right = (
+        np.stack(
+            [strength(f"eyeLookUp{side}") - strength(f"eyeLookDown{side}"), strength(f"{outer}{side}") - strength(f"{inner}{side}")], 1
+        )
+        for side, outer, inner in (("Left", "eyeLookOut", "eyeLookIn"), ("Right", "eyeLookIn", "eyeLookOut"))
+    )
+    return FULL_GAZE * np.stack([left, right], axis=1)
 
 
 def _with_blinks(actions: np.ndarray, time: np.ndarray, names: Sequence[str], rng: np.random.Generator) -> Float[np.ndarray, "N A"]:

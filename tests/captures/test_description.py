@@ -57,7 +57,11 @@ def test_unusable_descriptions_are_refused(tmp_path, text, message):
 
 
 def test_frames_round_trip(tmp_path):
-    frames = (Frame(7, 0.1, "train", "walk, slowly"), Frame(9, 0.30000000000000004, "test", "jump"))
+    frames = (
+        Frame(7, 0.1, "train", "walk, slowly"),
+        Frame(8, 0.2, "validation", "walk, slowly"),
+        Frame(9, 0.30000000000000004, "test", "jump"),
+    )
     save_frames(tmp_path / "frames.csv", frames)
     assert load_frames(tmp_path / "frames.csv") == frames
 
@@ -76,7 +80,7 @@ def test_frames_as_a_spreadsheet_writes_them(tmp_path):
         ("", r"columns frame,time,split,segment"),
         ("frame,time,split,segment\n", r"at least one frame in .*frames.csv"),
         ("frame,time,split,segment\n1,0,train,a\n1.5,0,train,a\n", r"in line 3 of .*frames.csv; got \['1.5'"),
-        ("frame,time,split,segment\n1,0,training,a\n", r"'number,seconds,train\|test,segment' in line 2"),
+        ("frame,time,split,segment\n1,0,training,a\n", r"'number,seconds,train\|validation\|test,segment' in line 2"),
         ("frame,time,split,segment\n1,0\n", r"in line 2 of"),
         ("frame,time,split,segment\n-1,0,train,a\n", r"in line 2 of"),
         ("frame,time,split,segment\n1,0,train,a\n01,1,train,a\n", r"frames.csv must list every frame once; got frame 1 twice"),

@@ -1,6 +1,6 @@
 import numpy as np
 
-from mitsuba_avatar.filming.face import conversation_face, expression_tour, resting_face
+from mitsuba_avatar.filming.face import conversation_face, expression_tour, gaze_of_actions, resting_face
 
 NAMES = ("browInnerUp", "eyeBlinkLeft", "eyeBlinkRight", "jawOpen", "mouthSmileLeft", "mouthSmileRight")
 
@@ -26,3 +26,12 @@ def test_talking_opens_the_jaw_again_and_again():
 
 def test_actions_that_a_rig_lacks_are_left_out():
     assert conversation_face(np.arange(20) / 10, ("unknown",), np.random.default_rng(0)).max() == 0
+
+
+def test_gaze_follows_the_looks_of_both_eyes():
+    names = ("eyeLookUpLeft", "eyeLookDownRight", "eyeLookOutLeft", "eyeLookInRight", "jawOpen")
+    actions = np.array([[0.4, 0, 0, 0, 1.0], [0, 0.6, 0, 0, 0], [0, 0, 0.8, 0.8, 0]])
+    gaze = gaze_of_actions(actions, names)
+    np.testing.assert_allclose(gaze[0], [[0.2, 0], [0, 0]])
+    np.testing.assert_allclose(gaze[1], [[0, 0], [-0.3, 0]])
+    np.testing.assert_allclose(gaze[2], [[0, 0.4], [0, 0.4]])  # both to the person's left

@@ -1,12 +1,15 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skeleton import Skeleton
-from mitsuba_avatar.filming.film import Performance
-from mitsuba_avatar.filming.motion import Motion, perform
+from mitsuba_avatar.filming.motion import Motion, body_angles, perform, pose_distances
 from mitsuba_avatar.filming.settings import MotionSettings, StudioSettings
+from tests.filming.acted import Acted
+from tests.filming.recordings import bvh_text, movement
 
 NAMES = ("eyeBlinkLeft", "eyeBlinkRight", "jawOpen", "mouthSmileLeft")
 
@@ -74,7 +77,7 @@ def test_arms_are_off_the_torso(rig: Rig, motion: Motion):
         assert (np.degrees(np.arccos(cosine)) > 20).mean() > 0.9
 
 
-def test_the_lowest_point_is_on_the_floor_in_every_frame(performance: Performance):
+def test_the_lowest_point_is_on_the_floor_in_every_frame(performance: Acted):
     np.testing.assert_allclose(performance.vertices[..., 2].min(axis=1), 0, atol=1e-5)
     rotations = performance.motion.root[:, :3, :3]
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (len(rotations), 1, 1)), atol=1e-5)
@@ -85,3 +88,113 @@ def test_more_frames_of_the_same_speed_at_another_rate(rig: Rig):
     slow = perform(rig, StudioSettings(motion=MotionSettings(train_frames=1, test_frames=20)), NAMES)
     fast = perform(rig, StudioSettings(motion=MotionSettings(train_frames=1, test_frames=40, fps=20.0)), NAMES)
     np.testing.assert_allclose(slow.theta[13:], fast.theta[25::2][: len(slow.theta[13:])], atol=1e-5)
+
+
+def test_the_default_script_is_the_one_it_was(motion: Motion):
+    """Captures filmed before there were other scripts are filmed alike: angles of a hand, an arm and a trunk, place and blinks."""
+    expected = {
+        50: ((0.0, -0.16425839, -0.13496041, 0.05382777, 0.50454766), (0.00722901, 0.02428935), 0.88347334),
+        149: ((0.02032077, -0.20011209, 0.598405, 0.12379961, -0.17160447), (-0.02072158, -0.00137575), 0.23046353),
+    }
+    for frame, (angles, place, blink) in expected.items():
+        np.testing.assert_allclose(motion.theta[frame, [0, 36, 39, 64, 82]], angles, atol=1e-5)
+        np.testing.assert_allclose(motion.root[frame, :2, 3], place, atol=1e-5)
+        np.testing.assert_allclose(motion.actions[frame, 0], blink, atol=1e-5)
+    assert motion.clearance.shape == (150,) and not motion.clearance.any()
+
+
+@pytest.fixture(scope="module", params=[0, 5], ids=["seed 0", "seed 5"])
+def study(rig: Rig, request: pytest.FixtureRequest) -> Motion:
+    settings = MotionSettings(script="study", train_frames=600, validation_frames=80, test_frames=160, stress_frames=30)
+    return perform(rig, StudioSettings(seed=request.param, motion=settings), NAMES)
+
+
+def frames_in(motion: Motion, start: str) -> np.ndarray:
+    return np.array([frame.segment.startswith(start) for frame in motion.frames])
+
+
+def test_study_moves_every_angle_slowly_in_training(rig: Rig, study: Motion):
+    train = np.array([frame.split == "train" for frame in study.frames])
+    moved = np.ptp(study.theta[train], axis=0)
+    assert [name for name, range_ in zip(rig.dofs.names, moved, strict=True) if range_ < 0.05] == []
+    body = study.theta[:, body_angles(rig)]
+    for segment in study.segments():
+        if study.frames[segment.start].segment.startswith(("slow", "test")):
+            assert np.degrees(np.linalg.norm(np.diff(body[segment], axis=0), axis=1)).max() < 20  # in a tenth of a second
+    assert (study.theta >= rig.dofs.lower - 1e-6).all() and (study.theta <= rig.dofs.upper + 1e-6).all()
+
+
+def test_study_moves_one_limb_at_a_time(rig: Rig, study: Motion):
+    left = frames_in(study, "slow_left_arm")
+    still = [i for i, name in enumerate(rig.dofs.names) if name.startswith(("right_shoulder", "right_elbow", "spine", "left_hip"))]
+    moving = [i for i, name in enumerate(rig.dofs.names) if name.startswith("left_shoulder")]
+    assert np.ptp(study.theta[left][:, still], axis=0).max() < 1e-6
+    assert np.degrees(np.ptp(study.theta[left][:, moving], axis=0)).min() > 25
+
+
+def test_face_and_fingers_move_while_the_body_holds_still(rig: Rig, study: Motion):
+    held = frames_in(study, "held_expressions")
+    body = study.theta[held][:, body_angles(rig)]
+    steps = np.abs(np.diff(body, axis=0)).max(axis=1)
+    assert (steps < 1e-6).mean() > 0.55  # the rest is changing from pose to pose
+    poses = np.unique(body[1:][steps < 1e-6].round(4), axis=0)
+    assert len(poses) >= 3
+    fingers = [i for i, name in enumerate(rig.dofs.names) if name.endswith("index_base_flexion")]
+    assert np.abs(np.diff(study.theta[held][:, fingers], axis=0))[steps < 1e-6].mean() > 0.02
+    assert np.ptp(study.actions[held], axis=0).max() > 0.5
+
+
+def test_study_tests_are_thirty_to_sixty_degrees_from_training_and_stress_is_farther(rig: Rig, study: Motion):
+    distance = np.degrees(pose_distances(rig, study))
+    tests = {frame.segment for frame in study.frames if frame.segment.startswith("test")}
+    assert len(tests) >= 3
+    for name in tests:
+        far = distance[frames_in(study, name)]
+        assert 40 < np.median(far) < 50, name
+        assert ((far > 25) & (far < 65)).mean() > 0.85, name
+    assert np.median(distance[frames_in(study, "stress")]) > 80
+    validation = np.array([frame.split == "validation" for frame in study.frames])
+    assert np.median(distance[validation]) < 20
+    assert distance[[frame.split == "train" for frame in study.frames]].max() == 0
+
+
+def test_arms_of_the_study_are_off_the_torso(rig: Rig, study: Motion):
+    skeleton = Skeleton(rig)
+    with torch.no_grad():
+        joints = skeleton.posed_joints(skeleton(torch.from_numpy(study.theta), torch.from_numpy(study.root))).numpy()
+    at = {name: joints[:, rig.joint_names.index(name)] for name in rig.joint_names}
+    calm = ~frames_in(study, "stress")
+    down = at["spine05"] - at["spine01"]
+    for side in "LR":
+        arm = at[f"lowerarm01.{side}"] - at[f"upperarm01.{side}"]
+        cosine = (arm * down).sum(axis=1) / np.linalg.norm(arm, axis=1) / np.linalg.norm(down, axis=1)
+        assert np.degrees(np.arccos(cosine))[calm].min() > 18
+
+
+def test_recordings_are_played_with_training_validation_and_test_parts(rig: Rig, tmp_path: Path):
+    (tmp_path / "sway.bvh").write_text(bvh_text(*movement(91)), encoding="utf-8")
+    settings = MotionSettings(
+        script="mocap", bvh=(str(tmp_path / "sway.bvh"),), train_frames=15, validation_frames=4, test_frames=6, stress_frames=3
+    )
+    motion = perform(rig, StudioSettings(motion=settings), NAMES)
+    assert [frame.split for frame in motion.frames].count("validation") == 4
+    assert [frame.segment for frame in motion.frames] == ["sway"] * 19 + ["test_sway"] * 6 + ["stress_wild"] * 3
+    elbow = motion.theta[:19, rig.dofs.names.index("left_elbow_flexion")]
+    assert np.ptp(elbow) > 0.4
+    assert any("limbs" in note for note in motion.notes)
+    assert motion.actions[:25].max() > 0.2
+    with pytest.raises(ValueError, match="expected 150 frames"):
+        perform(rig, StudioSettings(motion=MotionSettings(script="mocap", bvh=settings.bvh)), NAMES)
+
+
+def test_a_recorded_face_replaces_the_scripts_and_turns_the_eyes(rig: Rig, tmp_path: Path):
+    rows = [f"00:00:0{second}:00,61,{value},{value},0.5,0.25,0,{value}" for second, value in ((1, 0.0), (2, 0.8))]
+    path = tmp_path / "face.csv"
+    header = "Timecode,BlendshapeCount,EyeBlinkLeft,EyeBlinkRight,JawOpen,MouthSmileLeft,HeadYaw,EyeLookUpLeft"
+    path.write_text("\n".join([header, *rows]), encoding="utf-8")
+    names = (*NAMES, "eyeLookUpLeft")
+    settings = MotionSettings(train_frames=8, test_frames=3, face_recording=str(path))
+    motion = perform(rig, StudioSettings(motion=settings), names)
+    np.testing.assert_allclose(motion.actions[:11, 0], 0.8 * np.arange(11) / 10, atol=1e-6)
+    np.testing.assert_allclose(motion.actions[:, 2:4], [[0.5, 0.25]] * 11, atol=1e-6)
+    np.testing.assert_allclose(motion.theta[10, rig.dofs.names.index("left_eye_elevation")], 0.4, atol=1e-6)
