@@ -52,25 +52,29 @@ class KinematicCloth:
     def __init__(self, anatomy: Anatomy, body: DressedBody, seed: int):
         """Lay the folds out; `seed` varies their phases."""
         self.anatomy, self.body = anatomy, body
-        self.folds = _folds(anatomy)
+        self.folds = [fold for fold in _folds(anatomy) if fold.garment in body.coverage]
         self.gap = ((body.vertices - body.skin) * body.normals).sum(axis=1)  # [V] metres of cloth over skin
         rng = np.random.default_rng(seed)
         patterns = [pattern for fold in self.folds for pattern in self._patterns(fold, rng)]
-        self.patterns = np.stack(patterns).astype(np.float32)  # [2 * folds, V] metres along normals
+        self.patterns = np.array(patterns, np.float32).reshape(-1, len(body.vertices))  # [2 * folds, V] metres along normals
         self.ride = self._ride()  # [V, 3] metres at full ride
 
-    def displacements(self, theta: Float32[np.ndarray, "N D"], fps: float, segments: list[slice]) -> Float32[np.ndarray, "N V 3"]:
-        """Offsets of the rest surface, frame by frame.
+    def states(self, theta: Float32[np.ndarray, "N D"], fps: float, segments: list[slice]) -> Float32[np.ndarray, "N P1"]:
+        """State of the cloth, frame by frame: the heights of all P patterns, and how far the shirt has ridden up.
 
         Args:
             theta: [N, D] radians.
             fps: frames per second, on which the lag depends.
             segments: runs of consecutive frames; each starts without history.
         """
-        heights = np.zeros((len(theta), len(self.patterns)), dtype=np.float32)
-        rides = np.zeros(len(theta), dtype=np.float32)
+        states = np.zeros((len(theta), len(self.patterns) + 1), dtype=np.float32)
         for segment in segments:
-            heights[segment], rides[segment] = self._state(theta[segment], fps)
+            states[segment, :-1], states[segment, -1] = self._state(theta[segment], fps)
+        return states
+
+    def displacements(self, states: Float32[np.ndarray, "N P1"]) -> Float32[np.ndarray, "N V 3"]:
+        """Offsets of the rest surface in some frames' states (`states`), metres."""
+        heights, rides = states[:, :-1], states[:, -1]
         along_normal = np.maximum(heights @ self.patterns, np.minimum(SMALLEST_GAP - self.gap, 0))  # cloth stays outside the skin
         return along_normal[..., None] * self.body.normals + rides[:, None, None] * self.ride
 
@@ -106,7 +110,8 @@ class KinematicCloth:
         """Displacement of the shirt at full ride: upwards along the surface, most at the hem."""
         vertices, normals = self.body.vertices.astype(np.float64), self.body.normals.astype(np.float64)
         base, neck = self.anatomy.joint("spine05")[2] - 0.05, self.anatomy.joint("neck01")[2]
-        torso = self.body.coverage["shirt"] * (self.anatomy.weight(ARM) < 0.5)
+        shirt = self.body.coverage.get("shirt", np.zeros(len(vertices), dtype=np.float32))
+        torso = shirt * (self.anatomy.weight(ARM) < 0.5)
         share = torso * smooth_step(vertices[:, 2], base + 0.75 * (neck - base), base)
         upwards = np.array([0, 0, 1.0]) - normals[:, 2:] * normals
         bulge = 0.25 * np.sin(np.pi * np.clip((vertices[:, 2] - base) / 0.3, 0, 1))[:, None] * normals  # what is pushed up bunches
