@@ -3,6 +3,7 @@
 The stages do the work; this module is the order in which they are called.
 """
 
+import dataclasses
 import math
 import signal
 import sys
@@ -20,7 +21,7 @@ from mitsuba_avatar.filming.film import default_capture_path, film_capture
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.presets import resolve
-from mitsuba_avatar.progress import progress_bar
+from mitsuba_avatar.progress import StageProgress, progress_bar
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion, FrameOcclusion
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.reporting.camera_paths import orbit
@@ -55,8 +56,8 @@ def open_capture(settings: Settings, process: Process = Process()) -> Capture:  
         folder = default_capture_path(studio)
         if process.is_main and not (folder / "capture.yaml").exists():
             sys.stderr.write("No capture given: filming the embedded one (once; later fits reuse it).\n")
-            with progress_bar("filming", 1) as bar:
-                film_capture(studio, folder, bar.update)
+            with StageProgress() as progress:
+                film_capture(studio, folder, progress.update)
         while not (folder / "capture.yaml").exists():  # other ranks wait for the one that films
             time.sleep(1.0)
         capture = open_as_set(folder, settings.capture)
@@ -136,7 +137,13 @@ class Fit:
                 if iteration % LOG_EVERY == 0 or psnr is not None:
                     record = {"iteration": iteration, **terms, "learning_rate": trainer.learning_rate(iteration - 1)}
                     milliseconds = {f"{name}_ms": value for name, value in trainer.timer.means().items()}
-                    log.write(record | milliseconds | ({} if psnr is None else {"validation_psnr": psnr}))
+                    skipped = [dataclasses.asdict(step) for step in trainer.guard.tell()]
+                    log.write(
+                        record
+                        | milliseconds
+                        | ({} if psnr is None else {"validation_psnr": psnr})
+                        | ({"skipped": skipped, "skipped_in_all": trainer.guard.num_skipped} if skipped else {})
+                    )
                 if iteration % training.preview_every == 0 or is_last:
                     save_image(self.run.previews / f"{iteration:06d}.png", presentation.preview(shots))
                 if iteration % training.checkpoint_every == 0 or is_last:

@@ -3,6 +3,9 @@
 A preset is a YAML file with any subset of the keys of a settings dataclass; what it leaves out keeps the default. `resolve` merges
 preset and overrides and refuses unknown keys (naming the nearest known one) and wrong types. The resolved copy is written into the
 run folder, and `load_settings` reads it back unchanged. Everything here works for any frozen dataclass of settings, nested or flat.
+
+A preset may say `base: ablation/ours` and list only what it changes. One level deep: a base has no base of its own, so that two files
+tell all there is to know.
 """
 
 import dataclasses
@@ -21,6 +24,8 @@ from mitsuba_avatar.resources import find_resource
 from mitsuba_avatar.settings import Settings
 
 SettingsType = TypeVar("SettingsType")
+
+BASE = "base"  # key of a preset that names the one it changes
 
 
 def setting_types(kind: type) -> dict[str, Any]:
@@ -89,24 +94,48 @@ _Dumper.add_representer(tuple, lambda dumper, value: dumper.represent_sequence("
 
 
 def _read_preset(path: Path, kind: type) -> dict[str, Any]:
-    """Dotted key -> checked value of each key in a YAML file."""
+    """Dotted key -> checked value of each key in a YAML file, and of its base's where the file does not say otherwise."""
+    values = _read_yaml(path)
+    base = values.pop(BASE, None)
+    if base is None:
+        return _checked_preset(values, kind, str(path))
+    if not isinstance(base, str):
+        raise ValueError(f"load_settings(): {path}: expected {BASE} to be the name of a preset; got {base!r}. Write {BASE}: NAME.")
+    base_path = find_resource("configs", base, ".yaml")
+    base_values = _read_yaml(base_path)
+    if BASE in base_values:
+        raise ValueError(
+            f"load_settings(): {path}: expected a base without a base of its own; {base} has {base_values[BASE]!r}. "
+            "Name that one, and list what both change."
+        )
+    return _checked_preset(base_values, kind, str(base_path)) | _checked_preset(values, kind, str(path))
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """Top-level mapping of a YAML file."""
     if not path.is_file():
         raise FileNotFoundError(f"load_settings(): expected a YAML file at {path}; there is none. Check the path.")
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 (_Loader is a SafeLoader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"load_settings(): {path} is not valid YAML: {error}. Mend the file.") from error
+    if not isinstance(content, Mapping | None):
+        raise ValueError(f"load_settings(): {path}: expected the file to be a mapping of keys to values; got {content!r}. Indent its keys.")
+    return dict(content or {})
+
+
+def _checked_preset(content: Mapping[str, Any], kind: type, source: str) -> dict[str, Any]:
+    """Dotted key -> checked value of a file's content."""
     known = setting_types(kind)
-    values = _flatten({} if content is None else content, {key.rpartition(".")[0] for key in known}, str(path))
-    return {key: _checked(value, key, known, str(path)) for key, value in values.items()}
+    values = _flatten(content, {key.rpartition(".")[0] for key in known}, source)
+    return {key: _checked(value, key, known, source) for key, value in values.items()}
 
 
 def _flatten(content: Any, sections: set[str], source: str, section: str = "") -> dict[str, Any]:
     """Nested mappings -> dotted keys; an empty section is allowed."""
     if not isinstance(content, Mapping):
         raise ValueError(
-            f"load_settings(): {source}: expected {section or 'the file'} to be a mapping of keys to values; "
-            f"got {content!r}. Indent its keys."
+            f"load_settings(): {source}: expected {section} to be a mapping of keys to values; got {content!r}. Indent its keys."
         )
     values = {}
     for name, value in content.items():

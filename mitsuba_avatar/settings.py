@@ -126,12 +126,33 @@ class LossSettings:
     mask: float = 0.5  # per fraction of the foreground that is covered wrongly
     geometry: float = 1.0  # per square centimetre of mean squared vertex distance
     laplacian: float = 1.0  # per square centimetre of mean squared difference of mesh Laplacians
-    kl: float = 1e-4  # per nat and pose, summed over the latent code
+    kl: float = 1e-4  # per nat and pose, summed over the latent code; variational preferencing (section 3.5.1) is to raise it
+    mutual_information: float = 0.0  # per nat that the latent code is estimated to tell about the driving signal (section 3.5.2)
+    perturbation: float = 0.0  # per square centimetre that a latent code drawn from the prior moves the driven keypoints (section 3.5.3)
     geometry_iterations: int = 300  # mesh supervision ends here (paper: 2000)
     geometry_after: float = 0.3  # factor on `geometry` after that; 0 as in the paper, where the tracked mesh is worse than the images
 
     def __post_init__(self) -> None:
         expect(self, "zero or more", "image", "mask", "geometry", "laplacian", "kl", "geometry_iterations", "geometry_after")
+        expect(self, "zero or more", "mutual_information", "perturbation")
+
+
+@dataclass(frozen=True)
+class DisentanglementSettings:
+    """The estimator of mutual information between latent code and driving signal; its weight is `loss.mutual_information`."""
+
+    statistics_channels: int = 128  # hidden features of the statistics network
+    memory: int = 512  # recent pairs of latent code and driving signal that it learns from; old ones show an encoder that is gone
+    pairs: int = 128  # drawn from the memory for each update, and remembered driving signals that a batch is compared with
+    updates: int = 2  # of the statistics network, a step of the avatar
+    statistics_learning_rate: float = 1e-3  # of its own optimizer
+    moving_average: float = 0.05  # rate of the average that corrects the biased gradient
+
+    def __post_init__(self) -> None:
+        expect(self, "positive", "statistics_channels", "memory", "pairs", "updates", "statistics_learning_rate")
+        expect(self, "between 0 and 1", "moving_average")
+        if self.pairs < 2:
+            raise ValueError(f"DisentanglementSettings(): expected pairs of at least 2, to be mismatched; got {self.pairs}. Raise it.")
 
 
 @dataclass(frozen=True)
@@ -144,6 +165,8 @@ class TrainingSettings:
     learning_rate: float = 2e-3  # paper: 1e-3, for days of training
     learning_rate_final: float = 1e-4  # cosine decay ends here
     gradient_clip: float = 1.0  # global norm
+    explosion_factor: float = 10.0  # a step whose loss exceeds the running mean by this factor is skipped
+    skipped_steps: int = 2  # bad steps within 20 iterations that a run survives
     seed: int = 0
     checkpoint_every: int = 200
     validate_every: int = 200
@@ -152,7 +175,8 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         expect(self, "positive", "iterations", "poses_per_batch", "views_per_pose", "learning_rate", "learning_rate_final", "gradient_clip")
         expect(self, "positive", "checkpoint_every", "validate_every", "preview_every")
-        expect(self, "zero or more", "seed")
+        expect(self, "positive", "explosion_factor")
+        expect(self, "zero or more", "seed", "skipped_steps")
 
 
 @dataclass(frozen=True)
@@ -177,5 +201,6 @@ class Settings:
     model: ModelSettings = field(default_factory=ModelSettings)
     rendering: RenderingSettings = field(default_factory=RenderingSettings)
     loss: LossSettings = field(default_factory=LossSettings)
+    disentanglement: DisentanglementSettings = field(default_factory=DisentanglementSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)

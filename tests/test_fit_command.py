@@ -348,3 +348,24 @@ def test_divergence_is_one_line(drawn_capture, private_cache, tmp_path, capsys):
     assert fit(drawn_capture.path, tmp_path / "run", *words) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("fit:")]
     assert "is not finite at iteration" in line and "frames [" in line and "cameras [[" in line and "Lower training.learning_rate" in line
+
+
+def test_skipped_steps_are_in_the_log(drawn_capture, private_cache, tmp_path, monkeypatch):
+    """One bad batch: the fit ends well, and its log names the batch."""
+    from mitsuba_avatar.training.batches import FrameReader
+
+    read, calls = FrameReader.read, []
+
+    def read_damaged(self, frames, camera_names):
+        batch = read(self, frames, camera_names)
+        calls.append(frames)
+        if len(calls) == 1:
+            batch.masks[0, 0, 0, 0] = float("nan")
+        return batch
+
+    monkeypatch.setattr(FrameReader, "read", read_damaged)
+    assert fit(drawn_capture.path, tmp_path / "run", *SHORTEST_FIT) == 0
+    (record,) = read_records(tmp_path / "run/metrics.jsonl")
+    (skipped,) = record["skipped"]
+    assert record["skipped_in_all"] == 1 and skipped["iteration"] == 0 and "mask" in skipped["reason"]
+    assert skipped["frames"] == [index + 20 for index in calls[0]] and len(skipped["cameras"]) == 2

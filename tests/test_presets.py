@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 
 from mitsuba_avatar.filming.settings import MotionSettings, StudioSettings
-from mitsuba_avatar.presets import load_settings, nearest_key, resolve, save_settings
+from mitsuba_avatar.presets import load_settings, nearest_key, resolve, save_settings, setting_types
 from mitsuba_avatar.settings import Settings
 
 
@@ -145,3 +145,65 @@ def test_missing_files_are_named(tmp_path):
         load_settings(tmp_path / "absent.yaml")
     with pytest.raises(FileNotFoundError, match=r"expected a file, or a name of configs/; got 'tinny'"):
         resolve("tinny")
+
+
+def test_a_preset_changes_its_base_and_nothing_else(tmp_path):
+    (tmp_path / "base.yaml").write_text("training:\n  iterations: 7\n  seed: 3\nmodel:\n  decoder_channels: [8, 4]\n")
+    preset = write_preset(tmp_path, f"base: {tmp_path}/base.yaml\ntraining:\n  seed: 4\n")
+    for settings in (resolve(preset), load_settings(preset)):
+        assert (settings.training.iterations, settings.training.seed, settings.model.decoder_channels) == (7, 4, (8, 4))
+    assert resolve(preset, ["training.iterations=9"]).training.iterations == 9
+    assert resolve(write_preset(tmp_path, "base: tiny\n")) == resolve("tiny"), "a base may be named like any preset"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("base: [tiny]\n", "preset.yaml: expected base to be the name of a preset; got ['tiny']. Write base: NAME."),
+        ("base: ablation/pose_face\n", "expected a base without a base of its own; ablation/pose_face has 'ablation/ours'."),
+        ("base: tiny\ntraining:\n  iteratons: 7\n", "preset.yaml: expected a known setting; got 'training.iteratons'."),
+        ("model:\n  base: tiny\n", "got 'model.base'."),
+    ],
+)
+def test_bad_bases_are_refused(tmp_path, text, message):
+    with pytest.raises(ValueError) as caught:
+        load_settings(write_preset(tmp_path, text))
+    assert message in str(caught.value)
+
+
+def test_a_fault_of_the_base_is_named_with_its_file(tmp_path):
+    (tmp_path / "base.yaml").write_text("training:\n  iterations: many\n")
+    with pytest.raises(ValueError, match=r"base\.yaml: expected training\.iterations to be an integer"):
+        resolve(write_preset(tmp_path, f"base: {tmp_path}/base.yaml\n"))
+    with pytest.raises(FileNotFoundError, match="got 'ablation/hours'"):
+        resolve(write_preset(tmp_path, "base: ablation/hours\n"))
+
+
+NO_DISENTANGLEMENT = {"loss.mutual_information": 0.0, "loss.perturbation": 0.0}
+PLAIN_DECODER = {"model.use_localization": False, "model.use_shadow": False}
+ABLATIONS = {
+    "pose_face": PLAIN_DECODER | {"model.use_latent": False},
+    "pose_face_latent": PLAIN_DECODER | NO_DISENTANGLEMENT,
+    "without_disentanglement": NO_DISENTANGLEMENT,
+    "without_localization": {"model.use_localization": False},
+    "without_shadow": {"model.use_shadow": False},
+    "without_compression": {"model.use_compression": False},
+}
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_each_ablation_differs_from_ours_only_in_what_its_name_says(name):
+    def values(preset):
+        settings = resolve(f"ablation/{preset}")
+        return {key: getattr(getattr(settings, key.partition(".")[0]), key.partition(".")[2]) for key in setting_types(Settings)}
+
+    ours, other = values("ours"), values(name)
+    assert {key: other[key] for key in ours if other[key] != ours[key]} == ABLATIONS[name]
+
+
+def test_ours_has_every_part_and_every_strategy():
+    ours = resolve("ablation/ours")
+    assert ours.model.use_latent and ours.model.use_localization and ours.model.use_compression and ours.model.use_shadow
+    assert ours.loss.kl > 0 and ours.loss.mutual_information > 0 and ours.loss.perturbation > 0
+    folder = Path(__file__).parents[1] / "configs/ablation"
+    assert {path.stem for path in folder.glob("*.yaml")} == {"ours", *ABLATIONS}

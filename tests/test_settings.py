@@ -3,7 +3,7 @@
 import pytest
 
 from mitsuba_avatar.filming.settings import StudioSettings
-from mitsuba_avatar.settings import LossSettings, ModelSettings
+from mitsuba_avatar.settings import DisentanglementSettings, LossSettings, ModelSettings
 
 
 def test_values_given_in_python_are_checked_too():
@@ -11,5 +11,7 @@ def test_values_given_in_python_are_checked_too():
         LossSettings(image=float("nan"))
     with pytest.raises(ValueError, match=r"expected latent_size to be positive; got 0"):
         ModelSettings(latent_size=0)
+    with pytest.raises(ValueError, match=r"expected pairs of at least 2, to be mismatched; got 1"):
+        DisentanglementSettings(pairs=1)
     with pytest.raises(ValueError, match="it names a folder; got '../x'"):
         StudioSettings(name="../x")

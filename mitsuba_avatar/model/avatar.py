@@ -189,12 +189,21 @@ class Avatar(nn.Module):
             self._latent(z, len(theta)),
             self.view_maps(posed_from_rest, camera_centers),
         )
-        # Every texel of the map is the decoder's own, so lookups across a chart's border need no inpainting.
-        displacement = self.atlas.vertices_from_texels(maps.displacement)
-        rest_vertices = self.template_vertices + self.settings.displacement_scale * displacement
+        rest_vertices = self._displaced(maps.displacement)
         vertices = pose_vertices(rest_vertices, posed_from_rest, self.skinning_weights)
         gain = self._gain(ambient_occlusion, len(theta))
         return AvatarOutput(rest_vertices, vertices, self._textures(maps.texture, maps.view_texture, gain), gain)
+
+    def decode_rest_vertices(
+        self, theta: Float[Tensor, "P D"], face: Float[Tensor, "P F"], z: Float[Tensor, "P Z"] | None
+    ) -> Float[Tensor, "P V 3"]:
+        """The `rest_vertices` of `decode` alone, without cameras, occlusion or texture; arguments, gradients and errors as there."""
+        z = self._latent(z, len(theta))
+        return self._displaced(self.decoder.displacement(self.standardize_theta(theta), self.standardize_face(face), z))
+
+    def standardized_driving(self, theta: Float[Tensor, "P D"], face: Float[Tensor, "P F"]) -> Float[Tensor, "P DF"]:
+        """The driving signal as one vector c = (theta, face), each in its own unit of deviation."""
+        return torch.cat([self.standardize_theta(theta), self.standardize_face(face)], dim=1)
 
     def forward(
         self,
@@ -229,6 +238,11 @@ class Avatar(nn.Module):
         posterior = self.encode(self.unpose(registered_vertices, theta, root))
         z = posterior.mu if noise is None else posterior.sample(noise)
         return self.decode(theta, root, face, z, camera_centers, ambient_occlusion), posterior
+
+    def _displaced(self, displacement: Float[Tensor, "P 3 G G"]) -> Float[Tensor, "P V 3"]:
+        """Template plus decoded displacement, rest space."""
+        # Every texel of the map is the decoder's own, so lookups across a chart's border need no inpainting.
+        return self.template_vertices + self.settings.displacement_scale * self.atlas.vertices_from_texels(displacement)
 
     def _latent(self, z: Tensor | None, poses: int) -> Tensor | None:
         """The latent code that the decoder reads."""

@@ -4,6 +4,7 @@ Everything random in iteration i follows from the base seed and i, so that a res
 to the order of float sums. Source: arXiv:2105.10441, section 3.6.
 """
 
+import dataclasses
 import inspect
 import json
 import math
@@ -23,18 +24,17 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.model.keypoints import DrivenKeypoints, lists_face_landmarks
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.settings import Settings
 from mitsuba_avatar.training.batches import FrameBatch, FrameReader, batches, training_sampler
 from mitsuba_avatar.training.checkpoints import Checkpoints
 from mitsuba_avatar.training.distributed import Process
-from mitsuba_avatar.training.losses import LossInputs, evaluate_losses, loss_weights, weighted_sum
+from mitsuba_avatar.training.divergence import DivergedError, DivergenceGuard, SkippedStep
+from mitsuba_avatar.training.losses import LATENT_TERMS, LossInputs, evaluate_losses, loss_weights, weighted_sum
+from mitsuba_avatar.training.mutual_information import MutualInformation
 
 SEED_STRIDE = 1 << 20  # renderer seeds of different ranks and runs stay apart for a million iterations
-
-
-class DivergedError(FloatingPointError):
-    """Surface, loss or gradient are not finite; the message names iteration, frames and cameras."""
 
 
 class StepTimer:
@@ -84,6 +84,8 @@ class Trainer:
         self.laplacian = Laplacian(rig.topology).to(self.device)
         self.optimizer = torch.optim.Adam(avatar.parameters(), lr=training.learning_rate, fused=True)
         self.sampler = training_sampler(reader.capture, training, process)
+        self.information, self.keypoints = self._disentanglement(rig)
+        self.guard = DivergenceGuard(training)
         self.iteration = 0
         self.timer = StepTimer()
 
@@ -95,12 +97,19 @@ class Trainer:
 
         Returns:
             Whether the last iteration was reached.
+
+        Raises:
+            DivergedError: too many bad steps; single ones are skipped, and after_step gets the terms of the last good one.
         """
+        terms: dict[str, float] = {}
         with closing(batches(self.reader, self.sampler, self.iteration, self.settings.training.iterations)) as stream:
             while self.iteration < self.settings.training.iterations:
                 with self.timer.part("data"):
                     batch = next(stream)
-                terms = self.step(batch)
+                try:
+                    terms = self.step(batch)
+                except DivergedError as error:
+                    self.guard.skip(SkippedStep(self.iteration, self._frame_numbers(batch), batch.camera_names, str(error)))
                 self.iteration += 1
                 if not after_step(self.iteration, terms):
                     return False
@@ -113,59 +122,43 @@ class Trainer:
             The loss terms, unweighted, and their weighted sum "loss"; means over the ranks of a distributed run.
 
         Raises:
-            DivergedError: surface, a term or a gradient is not finite; no parameter was changed.
+            DivergedError: surface, a term or a gradient is not finite, or the loss explodes, here or on another rank; no parameter
+                was changed.
         """
-        settings = self.settings
-        weights = loss_weights(settings.loss, self.iteration)
-        if not settings.model.use_latent:
-            weights.pop("kl", None)
-        if batch.vertices is None:
-            weights = {name: weight for name, weight in weights.items() if name not in ("geometry", "laplacian")}
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(self.iteration)
         batch = batch.to(self.device)
-        with self.timer.part("decoder"):
-            output, posterior = self.model(
-                batch.vertices,
-                batch.theta,
-                batch.root,
-                batch.face,
-                batch.camera_centers,
-                batch.ambient_occlusion,
-                self.latent_noise(len(batch.frames)).to(self.device),
-            )
-        self._require_finite("surface", {"vertices": output.vertices.detach().abs().sum()}, batch)
-        with self.timer.part("render"):
-            seed = (settings.training.seed * self.process.num_ranks + self.process.rank) * SEED_STRIDE + self.iteration
-            radiance, mask = self.renderer.render(output.vertices, output.textures.flatten(0, 1), batch.cameras, seed=seed)
-            image = radiance + (1 - mask) * batch.backgrounds
-        with self.timer.part("losses"):
-            inputs = LossInputs(
-                image=encode(image, "srgb"),
-                mask=mask,
-                target_image=batch.images,
-                target_mask=batch.masks,
-                vertices=output.vertices,
-                tracked_vertices=batch.vertices,
-                posterior=posterior,
-                laplacian=self.laplacian,
-            )
-            terms = evaluate_losses(inputs, weights)
+        weights = self._weights(batch)
+        problem = None
+        try:
+            terms, latents = self._losses(batch, weights)
             loss = weighted_sum(terms, weights)
-        self._require_finite("loss term", {name: value.detach() for name, value in terms.items()}, batch)
+            self._require_calm(float(loss.detach()), terms, weights, batch)
+        except DivergedError as error:
+            problem = error
+        # Before the backward pass, where the ranks wait for each other: all skip the step, or none.
+        if self.is_any_rank(problem is not None):
+            raise problem or DivergedError(f"step(): another rank's batch of iteration {self.iteration} was refused; its message says why.")
         with self.timer.part("backward"):
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.avatar.parameters(), settings.training.gradient_clip)
+        norm = nn.utils.clip_grad_norm_(self.avatar.parameters(), self.settings.training.gradient_clip)
         self._require_finite("gradient", {"norm": norm}, batch)
         with self.timer.part("optimizer"):
             self.optimizer.step()
+        if self.information is not None and latents is not None:
+            with self.timer.part("information"):
+                self.information.observe(latents, self.avatar.standardized_driving(batch.theta, batch.face))
         self.timer.steps += 1
         values = self._mean_over_ranks(torch.stack([loss.detach(), *(value.detach() for value in terms.values())]))
-        return dict(zip(("loss", *terms), values.tolist(), strict=True))
+        means = dict(zip(("loss", *terms), values.tolist(), strict=True))
+        self.guard.accept(means["loss"])
+        return means
 
     def is_any_rank(self, flag: bool) -> bool:
         """Whether the flag is set on at least one rank of the run; all ranks must ask."""
+        if not self.process.is_distributed:
+            return flag
         return float(self._mean_over_ranks(torch.tensor(float(flag), device=self.device))) > 0
 
     def learning_rate(self, iteration: int) -> float:
@@ -177,17 +170,23 @@ class Trainer:
 
     def latent_noise(self, poses: int) -> Float[Tensor, "P Z"]:
         """Standard normal numbers of this iteration's poses, this rank's share of the global batch's."""
-        training = self.settings.training
-        generator = torch.Generator().manual_seed(training.seed * SEED_STRIDE + self.iteration)
-        noise = torch.randn(training.poses_per_batch, self.settings.model.latent_size, generator=generator)
-        return noise[self.process.rank * poses : (self.process.rank + 1) * poses]
+        return self._normal_numbers(poses)[0]
+
+    def prior_latents(self, poses: int) -> Float[Tensor, "P Z"]:
+        """Latent codes drawn from the prior for this iteration's poses, independent of `latent_noise`."""
+        return self._normal_numbers(poses)[1]
 
     def save(self, checkpoints: Checkpoints, psnr: float | None) -> None:
         """Write a checkpoint; see `Checkpoints.save`."""
-        checkpoints.save(self.avatar.state_dict(), {"optimizer": self.optimizer.state_dict()}, self.iteration, psnr)
+        state = {"optimizer": self.optimizer.state_dict(), "guard": self.guard.state_dict()}
+        if self.information is not None:
+            state["information"] = self.information.state_dict()
+        checkpoints.save(self.avatar.state_dict(), state, self.iteration, psnr)
 
     def resume(self, checkpoints: Checkpoints) -> None:
         """Continue from the last checkpoint.
+
+        What the checkpoint lacks, because it is older or because a loss term was off, begins anew.
 
         Raises:
             FileNotFoundError, ValueError: no checkpoint, or one of another rig; see `Checkpoints`.
@@ -195,6 +194,85 @@ class Trainer:
         self.avatar.load_state_dict(checkpoints.load_avatar("last"))
         self.iteration, state = checkpoints.load_training()
         self.optimizer.load_state_dict(state["optimizer"])
+        if "guard" in state:
+            self.guard.load_state_dict(state["guard"])
+        if self.information is not None and "information" in state:
+            self.information.load_state_dict(state["information"])
+
+    def _disentanglement(self, rig: Rig) -> tuple[MutualInformation | None, DrivenKeypoints | None]:
+        """What the two disentangling terms need, each where its weight asks for it."""
+        settings, avatar = self.settings, self.avatar
+        information = keypoints = None
+        if settings.model.use_latent and settings.loss.mutual_information > 0:
+            driving_size = len(avatar.standardize_theta.mean) + len(avatar.standardize_face.mean)
+            information = MutualInformation(
+                settings.model.latent_size, driving_size, settings.disentanglement, settings.training.seed, self.device, self.process
+            )
+        if settings.model.use_latent and settings.loss.perturbation > 0:
+            face_signal = self.reader.capture.description.face_signal
+            with_face = lists_face_landmarks(rig, face_signal, len(avatar.standardize_face.mean))
+            keypoints = DrivenKeypoints(rig, avatar.template_vertices, with_face)
+        return information, keypoints
+
+    def _weights(self, batch: FrameBatch) -> dict[str, float]:
+        """Weights of the terms that this iteration and batch have."""
+        weights = loss_weights(self.settings.loss, self.iteration)
+        absent = () if self.settings.model.use_latent else LATENT_TERMS
+        if batch.vertices is None:
+            absent = (*absent, "geometry", "laplacian")
+        return {name: weight for name, weight in weights.items() if name not in absent}
+
+    def _losses(self, batch: FrameBatch, weights: dict[str, float]) -> tuple[dict[str, Tensor], Tensor | None]:
+        """Loss terms of a batch, and the latent codes that it was decoded with."""
+        settings, poses = self.settings, len(batch.frames)
+        noise = self.latent_noise(poses).to(self.device)
+        with self.timer.part("decoder"):
+            output, posterior = self.model(
+                batch.vertices, batch.theta, batch.root, batch.face, batch.camera_centers, batch.ambient_occlusion, noise
+            )
+        self._require_finite("surface", {"vertices": output.vertices.detach().abs().sum()}, batch)
+        with self.timer.part("render"):
+            seed = (settings.training.seed * self.process.num_ranks + self.process.rank) * SEED_STRIDE + self.iteration
+            textures = output.textures.flatten(0, 1)
+            image, mask = self.renderer.render(output.vertices, textures, batch.cameras, seed=seed, background=batch.backgrounds)
+        latents = None if posterior is None else posterior.sample(noise)  # the forward pass drew the same
+        with self.timer.part("losses"):
+            inputs = LossInputs(
+                image=encode(image, "srgb"),
+                mask=mask,
+                target_image=batch.images,
+                target_mask=batch.masks,
+                vertices=output.vertices,
+                tracked_vertices=batch.vertices,
+                posterior=posterior,
+                laplacian=self.laplacian,
+            )
+            terms = evaluate_losses(self._with_disentanglement(inputs, batch, latents), weights)
+        self._require_finite("loss term", {name: value.detach() for name, value in terms.items()}, batch)
+        return terms, latents
+
+    def _with_disentanglement(self, inputs: LossInputs, batch: FrameBatch, latents: Tensor | None) -> LossInputs:
+        """Inputs with the parts of the disentangling terms, where they are asked for."""
+        if self.information is not None and latents is not None:
+            driving = self.avatar.standardized_driving(batch.theta, batch.face)
+            inputs = dataclasses.replace(inputs, mutual_information=self.information.penalty(latents, driving))
+        if self.keypoints is not None:
+            z = self.prior_latents(len(batch.frames)).to(self.device)
+            rest_vertices = self.avatar.decode_rest_vertices(batch.theta, batch.face, z)
+            inputs = dataclasses.replace(
+                inputs,
+                keypoints=self.keypoints.from_surface(rest_vertices, batch.theta, batch.root),
+                driven_keypoints=self.keypoints.from_driving(batch.theta, batch.root, batch.face),
+            )
+        return inputs
+
+    def _normal_numbers(self, poses: int) -> tuple[Float[Tensor, "P Z"], Float[Tensor, "P Z"]]:
+        """Two independent draws for this rank's poses; both follow from seed and iteration."""
+        training, rank = self.settings.training, self.process.rank
+        generator = torch.Generator().manual_seed(training.seed * SEED_STRIDE + self.iteration)
+        shape = (training.poses_per_batch, self.settings.model.latent_size)
+        first, second = (torch.randn(shape, generator=generator)[rank * poses : (rank + 1) * poses] for _ in range(2))
+        return first, second
 
     def _mean_over_ranks(self, values: Tensor) -> Tensor:
         if self.process.is_distributed:
@@ -206,11 +284,26 @@ class Trainer:
     def _require_finite(self, what: str, values: dict[str, Tensor], batch: FrameBatch) -> None:
         bad = [name for name, value in values.items() if not math.isfinite(float(value))]
         if bad:
-            numbers = [self.reader.capture.frames[i].number for i in batch.frames]
+            raise DivergedError(f"step(): {what} {', '.join(bad)} is not finite {self._place_and_remedy(batch)}")
+
+    def _require_calm(self, loss: float, terms: dict[str, Tensor], weights: dict[str, float], batch: FrameBatch) -> None:
+        if self.guard.is_explosion(loss):
+            largest = max(terms, key=lambda name: weights[name] * float(terms[name].detach()))
             raise DivergedError(
-                f"step(): {what} {', '.join(bad)} is not finite at iteration {self.iteration}, frames {numbers}, cameras "
-                f"{batch.camera_names}. Lower training.learning_rate, or check these images; --resume continues from the last checkpoint."
+                f"step(): loss {loss:.4g} is more than {self.settings.training.explosion_factor:g} times its running mean "
+                f"{self.guard.mean_loss:.4g} (training.explosion_factor), most of it from {largest}, {self._place_and_remedy(batch)}"
             )
+
+    def _place_and_remedy(self, batch: FrameBatch) -> str:
+        """Where a message's number was met, and what to do."""
+        return (
+            f"at iteration {self.iteration}, frames {self._frame_numbers(batch)}, cameras {batch.camera_names}. "
+            "Lower training.learning_rate, or check these images; --resume continues from the last checkpoint."
+        )
+
+    def _frame_numbers(self, batch: FrameBatch) -> list[int]:
+        """The capture's numbers of a batch's frames."""
+        return [self.reader.capture.frames[i].number for i in batch.frames]
 
 
 def _data_parallel(avatar: Avatar) -> DistributedDataParallel:

@@ -7,12 +7,14 @@ Every term is a mean with a unit that does not change with image size, number of
     geometry   squared distance of a vertex to the tracked one, cm^2, mean over vertices
     laplacian  squared difference of mesh Laplacians, cm^2, mean over vertices
     kl         nats per pose, summed over the latent code
+    mutual_information  nats that the latent code tells about the driving signal, as estimated
+    perturbation        squared distance of driven keypoints under a random latent code, cm^2, mean over keypoints
 
 Image terms count *every* pixel, because a silhouette is learnt from both of its sides, but divide by the foreground alone: the weight
 of a person then does not fall with the amount of background that a camera happens to see. Colours are compared as they are given; the
 caller chooses the curve (linear radiance, or encoded for display).
 
-Symbols: B images, P poses, V vertices, Z latent size. Source: arXiv:2105.10441, section 3.6.
+Symbols: B images, P poses, V vertices, K keypoints, Z latent size. Source: arXiv:2105.10441, sections 3.5 and 3.6.
 """
 
 from dataclasses import dataclass
@@ -26,6 +28,8 @@ from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.settings import LossSettings
 
 CENTIMETRES = 100.0  # in a metre
+TERMS = ("image", "mask", "geometry", "laplacian", "kl", "mutual_information", "perturbation")
+LATENT_TERMS = ("kl", "mutual_information", "perturbation")  # of an avatar with a latent code alone
 
 
 def image_loss(image: Float[Tensor, "B 3 H W"], target: Float[Tensor, "B 3 H W"], target_mask: Float[Tensor, "B 1 H W"]) -> Tensor:
@@ -71,6 +75,14 @@ def kl_loss(posterior: Posterior) -> Tensor:
     return 0.5 * (mu.square() + logvar.exp() - 1 - logvar).sum(-1).mean()
 
 
+def perturbation_loss(keypoints: Float[Tensor, "P K 3"], driven_keypoints: Float[Tensor, "P K 3"]) -> Tensor:
+    """Mean squared distance of keypoints from where the driving signal puts them, cm^2 (L_pc); both in metres.
+
+    The paper sums over the keypoints; the mean keeps the weight independent of how many a rig has. Gradients: to both.
+    """
+    return (CENTIMETRES * (keypoints - driven_keypoints)).square().sum(-1).mean()
+
+
 @dataclass(frozen=True)
 class LossInputs:
     """What one step made, and what it should have been. A part that is None must not be asked for.
@@ -82,6 +94,9 @@ class LossInputs:
         tracked_vertices: [P, V, 3] registered mesh.
         posterior: of the encoder.
         laplacian: of the meshes' topology.
+        mutual_information: estimate of the statistics network, nats; a loss as it stands.
+        keypoints: [P, K, 3] of the surface decoded under a latent code drawn from the prior, metres.
+        driven_keypoints: [P, K, 3] the same as the driving signal gives them.
     """
 
     image: Float[Tensor, "B 3 H W"] | None = None
@@ -92,6 +107,9 @@ class LossInputs:
     tracked_vertices: Float[Tensor, "P V 3"] | None = None
     posterior: Posterior | None = None
     laplacian: Laplacian | None = None
+    mutual_information: Float[Tensor, ""] | None = None
+    keypoints: Float[Tensor, "P K 3"] | None = None
+    driven_keypoints: Float[Tensor, "P K 3"] | None = None
 
 
 def loss_weights(settings: LossSettings, iteration: int) -> dict[str, float]:
@@ -100,7 +118,7 @@ def loss_weights(settings: LossSettings, iteration: int) -> dict[str, float]:
     Mesh supervision leads the way, then steps back for the images (section 3.6): `geometry` is multiplied by `geometry_after` from
     iteration `geometry_iterations` on.
     """
-    weights = {name: getattr(settings, name) for name in ("image", "mask", "geometry", "laplacian", "kl")}
+    weights = {name: getattr(settings, name) for name in TERMS}
     if iteration >= settings.geometry_iterations:
         weights["geometry"] *= settings.geometry_after
     return {name: weight for name, weight in weights.items() if weight > 0}
@@ -122,6 +140,8 @@ def evaluate_losses(inputs: LossInputs, weights: dict[str, float]) -> dict[str, 
         "geometry": (geometry_loss, ("vertices", "tracked_vertices")),
         "laplacian": (laplacian_loss, ("vertices", "tracked_vertices", "laplacian")),
         "kl": (kl_loss, ("posterior",)),
+        "mutual_information": (lambda estimate: estimate, ("mutual_information",)),
+        "perturbation": (perturbation_loss, ("keypoints", "driven_keypoints")),
     }
     values = {}
     for name in weights:

@@ -259,3 +259,21 @@ def test_the_papers_full_size_decodes_with_the_right_shapes(rig, drive):
     assert output.gain.shape == (2, 1, 256, 256)
     assert output.vertices.shape == (2, 258, 3)
     assert posterior.mu.shape == (2, 512)
+
+
+def test_rest_vertices_alone_are_those_of_the_whole_decoder(make_avatar, drive):
+    """And need neither cameras nor occlusion; with and without a latent code."""
+    z = torch.randn((2, 16), generator=torch.Generator().manual_seed(4))
+    for avatar, code in ((make_avatar(), z), (make_avatar(), None), (make_avatar(use_latent=False), None)):
+        rest_vertices = avatar.decode_rest_vertices(drive["theta"], drive["face"], code)
+        torch.testing.assert_close(rest_vertices, avatar.decode(z=code, **drive).rest_vertices)
+    assert (make_avatar().decode_rest_vertices(drive["theta"], drive["face"], z) - rest_vertices).abs().max() > 1e-4
+    with pytest.raises(ValueError, match="model.use_latent is false"):
+        avatar.decode_rest_vertices(drive["theta"], drive["face"], z)
+
+
+def test_the_driving_signal_as_one_vector(make_avatar, drive):
+    avatar = make_avatar()
+    driving = avatar.standardized_driving(drive["theta"], drive["face"])
+    assert driving.shape == (2, 5 + 6)
+    torch.testing.assert_close(driving[:, 5:], avatar.standardize_face(drive["face"]))

@@ -106,6 +106,90 @@ def test_an_absurd_learning_rate_is_named(make_trainer):
     assert trainer.iteration < 5
 
 
+class DamagedReader(FrameReader):
+    """A reader some of whose calls return an image that is not a number, or one that is absurdly bright."""
+
+    def __init__(self, reader, damages):
+        super().__init__(reader.capture, reader.occlusion)
+        self.damages, self.calls = damages, 0
+
+    def read(self, frames, camera_names):
+        batch = super().read(frames, camera_names)
+        value = self.damages.get(self.calls)
+        self.calls += 1
+        if value is not None:
+            batch.images[1, 0, 2, 3] = value
+        return batch
+
+
+def test_a_bad_step_is_skipped_counted_and_told(make_trainer, reader):
+    """The run goes on as if the step had not been: same parameters before and after it, and it names frames and cameras."""
+    trainer = make_trainer("training.iterations=5", reader=DamagedReader(reader, {1: float("nan")}))
+    states, records = [], []
+
+    def after_step(iteration, terms):
+        states.append(parameters(trainer))
+        records.append(terms)
+        return True
+
+    assert trainer.run(after_step) and trainer.iteration == 5
+    assert torch.equal(states[0], states[1]) and not torch.equal(states[1], states[2])
+    assert records[1] == records[0], "the last good step's terms"
+    (skipped,) = trainer.guard.tell()
+    frames, cameras = trainer.sampler.draw(1)
+    assert (skipped.iteration, skipped.cameras) == (1, cameras) and skipped.frames == [frame + 20 for frame in frames]
+    assert "loss term image is not finite at iteration 1, frames [" in skipped.reason
+
+
+def test_an_exploding_step_is_skipped_and_names_the_term(make_trainer, reader):
+    trainer = make_trainer("training.iterations=24", "training.explosion_factor=3", reader=DamagedReader(reader, {22: 1e5}))
+    run(trainer)
+    (skipped,) = trainer.guard.tell()
+    assert skipped.iteration == 22 and "times its running mean" in skipped.reason and "most of it from image" in skipped.reason
+
+
+def test_repeated_bad_steps_stop_the_run(make_trainer, reader):
+    damages = dict.fromkeys((2, 4, 5), float("nan"))
+    trainer = make_trainer("training.iterations=9", "training.skipped_steps=2", reader=DamagedReader(reader, damages))
+    with pytest.raises(
+        DivergedError, match=r"got 3, 3 in all\. The last one: step\(\): loss term image is not finite at iteration 5, frames"
+    ):
+        run(trainer)
+
+
+@pytest.mark.parametrize("overrides", [("loss.mutual_information=0.1",), ("loss.perturbation=0.5",)], ids=["information", "perturbation"])
+def test_disentangling_terms_join_the_loss(make_trainer, overrides):
+    """They are logged, weighted and learnt from; without a latent code they are left out."""
+    name = overrides[0].split("=")[0].removeprefix("loss.")
+    (record,) = run(make_trainer(*overrides, "training.iterations=1"))
+    assert list(record) == [*TERMS, name]
+    (record,) = run(make_trainer(*overrides, "training.iterations=1", "model.use_latent=false"))
+    assert name not in record
+
+
+def test_the_perturbation_term_keeps_random_codes_from_moving_the_keypoints(make_trainer):
+    """Trained by it alone, the spread of the keypoints over prior samples shrinks to a fraction."""
+    only = [f"loss.{name}=0" for name in TERMS[1:]]
+    trainer = make_trainer(*only, "loss.perturbation=1", "training.iterations=60", "training.learning_rate=5e-3")
+    with torch.no_grad():
+        trainer.avatar.decoder.geometry.last[0].weight.normal_(std=0.3, generator=torch.Generator().manual_seed(0))
+    records = run(trainer)
+    first, last = (sum(record["perturbation"] for record in part) for part in (records[:5], records[-5:]))
+    assert last < 0.2 * first
+
+
+def test_information_is_observed_and_penalised(make_trainer):
+    trainer = make_trainer("loss.mutual_information=0.1", "training.iterations=2")
+    batch = trainer.reader.read(*trainer.sampler.draw(0))
+    trainer.information.observe(
+        torch.randn((100, 16), generator=torch.Generator().manual_seed(0)),
+        torch.randn((100, 8), generator=torch.Generator().manual_seed(1)),
+    )
+    assert trainer.step(batch)["mutual_information"] >= 0
+    assert trainer.information.seen == 102
+    torch.testing.assert_close(trainer.information.driving[100:102], trainer.avatar.standardized_driving(batch.theta, batch.face))
+
+
 def test_learning_rate_falls_along_a_cosine(make_trainer):
     trainer = make_trainer("training.iterations=10", "training.learning_rate=4e-3", "training.learning_rate_final=1e-3")
     rates = [trainer.learning_rate(i) for i in range(11)]
@@ -134,22 +218,36 @@ def test_ranks_share_the_noise_of_a_single_process(make_trainer, monkeypatch):
     assert torch.equal(torch.cat(shares), whole)
 
 
-def test_a_resumed_run_continues_the_same_curve(make_trainer, tmp_path):
+@pytest.mark.parametrize(
+    "overrides",
+    [(), ("loss.mutual_information=0.1", "loss.perturbation=0.1", "disentanglement.memory=64")],
+    ids=["plain", "disentangled"],
+)
+def test_a_resumed_run_continues_the_same_curve(make_trainer, tmp_path, monkeypatch, overrides):
     """Six steps, against three steps, a checkpoint, another process' worth of objects, and three more."""
-    overrides = ("training.iterations=6", "loss.geometry_iterations=4")
-    whole = make_trainer(*overrides)
+    # From the second step on the network learns, and the penalty counts whatever the estimate.
+    monkeypatch.setattr("mitsuba_avatar.training.mutual_information.FEWEST_PAIRS", 4)
+    monkeypatch.setattr("mitsuba_avatar.training.mutual_information.ESTIMATE_RATE", 0.0)
+    overrides = ("training.iterations=6", "loss.geometry_iterations=4", *overrides)
+    whole, first, second = (make_trainer(*overrides) for _ in range(3))
+    for trainer in (whole, first):
+        if trainer.information is not None:
+            trainer.information.running = 0.5
     expected = run(whole)
-    first = make_trainer(*overrides)
     records = run(first, stop=3)
     checkpoints = Checkpoints(tmp_path, "rig")
     first.save(checkpoints, None)
-    second = make_trainer(*overrides, "training.seed=0")
     with torch.no_grad():
         for parameter in second.avatar.parameters():
             parameter.fill_(0.5)
     second.resume(checkpoints)
     assert second.iteration == 3
     records += run(second)
+    assert second.guard.state_dict()["accepted"] == 6
+    if second.information is not None:
+        assert second.information.seen == 12 and records[-1]["mutual_information"] == 0.5
+        weights = [trainer.information.network.latent_embedding.weight for trainer in (second, whole)]
+        torch.testing.assert_close(*weights, rtol=0, atol=1e-3)
     for iteration, (got, wanted) in enumerate(zip(records, expected, strict=True)):
         assert got == pytest.approx(wanted, rel=1e-3, abs=1e-6), f"iteration {iteration}"
     # Scattered float sums come in another order each time, and Adam's first steps amplify that where gradients are nearly zero.

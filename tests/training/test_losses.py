@@ -19,6 +19,7 @@ from mitsuba_avatar.training.losses import (
     laplacian_loss,
     loss_weights,
     mask_loss,
+    perturbation_loss,
     weighted_sum,
 )
 from tests.small_rig import make_small_rig
@@ -173,3 +174,26 @@ def test_the_loss_is_the_weighted_sum_of_all_terms(topology):
 def test_a_term_that_lacks_its_target_is_refused_by_name():
     with pytest.raises(ValueError, match=r"the term 'geometry' needs \['tracked_vertices'\]; got None.*set loss.geometry to 0"):
         evaluate_losses(LossInputs(vertices=torch.zeros(2, 4, 3)), {"geometry": 1.0})
+
+
+def test_perturbation_loss_by_hand():
+    """Two poses, two keypoints; one is 3 cm off along x and 4 cm along z."""
+    driven = torch.randn((2, 2, 3), generator=torch.Generator().manual_seed(0))
+    keypoints = driven.clone().requires_grad_()
+    shifted = keypoints + torch.tensor([[[0.0, 0, 0], [0.03, 0, 0.04]], [[0.0, 0, 0], [0, 0, 0]]])
+    loss = perturbation_loss(shifted, driven)
+    assert float(loss.detach()) == pytest.approx(25 / 4, rel=1e-4)
+    loss.backward()
+    assert (keypoints.grad.abs().sum(-1) > 0).tolist() == [[False, True], [False, False]]
+
+
+def test_disentangling_terms_count_where_they_have_a_weight():
+    settings = LossSettings(0.0, 0.0, 0.0, 0.0, 0.0, mutual_information=0.2, perturbation=3.0)
+    weights = loss_weights(settings, 0)
+    keypoints = torch.tensor([[[0.01, 0.0, 0.0]]])
+    inputs = LossInputs(mutual_information=torch.tensor(1.5), keypoints=keypoints, driven_keypoints=torch.zeros(1, 1, 3))
+    terms = evaluate_losses(inputs, weights)
+    assert {name: pytest.approx(float(value)) for name, value in terms.items()} == {"mutual_information": 1.5, "perturbation": 1.0}
+    assert float(weighted_sum(terms, weights)) == pytest.approx(0.2 * 1.5 + 3.0)
+    with pytest.raises(ValueError, match="the term 'perturbation' needs"):
+        evaluate_losses(LossInputs(mutual_information=torch.tensor(1.5)), weights)
