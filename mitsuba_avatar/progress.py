@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -58,6 +58,24 @@ def progress_bar(description: str, total: int, initial: int = 0, is_shown: bool 
     ]
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         yield ProgressBar(console, progress, description, total, initial)
+
+
+class StageProgress:
+    """Bars for a step with several stages whose names and lengths come as it goes; use it in a `with` statement."""
+
+    def __enter__(self) -> "StageProgress":
+        self._stack, self._stage, self._bar = ExitStack(), "", None
+        return self
+
+    def update(self, stage: str, done: int, total: int) -> None:
+        """Set how much of a stage is done; a new name ends the bar of the last one and begins its own."""
+        if stage != self._stage:
+            self._stack.close()
+            self._stage, self._bar = stage, self._stack.enter_context(progress_bar(stage, total))
+        self._bar.update(done, total)
+
+    def __exit__(self, *reason: object) -> None:
+        self._stack.close()
 
 
 def _rate(per_second: float) -> str:

@@ -8,6 +8,7 @@ from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.studio import main
 
 SMALL = ["--preset", "tiny", "motion.train_frames", "2", "motion.test_frames=1", "cameras.train=2", "clothing.texture_size=64"]
+SMALL += ["clothing.is_simulated=false"]
 
 
 def test_it_films_a_capture_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -16,6 +17,29 @@ def test_it_films_a_capture_and_says_where(tmp_path: Path, capsys: pytest.Captur
     assert output.out.strip() == str(tmp_path / "capture")
     assert "3 frames from 3 cameras" in output.err
     assert len(Capture.open(tmp_path / "capture").frames) == 3
+    assert (tmp_path / "capture" / "video.mp4").stat().st_size > 1000
+
+
+def test_a_plan_films_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["--preset", "paper", "--plan", "--out", str(tmp_path / "capture")]) == 0
+    assert "7,000,000 images" in capsys.readouterr().out and not (tmp_path / "capture").exists()
+
+
+def test_what_takes_days_wants_a_shard(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["--preset", "paper", "--out", str(tmp_path / "capture")]) == 2
+    error = capsys.readouterr().err
+    assert "Give --shard" in error and not (tmp_path / "capture").exists()
+
+
+def test_gates_say_what_pose_explains_and_film_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Filming then goes on in the same folder, with the garments that are there."""
+    words = [*SMALL[:-1], "motion.test_frames=2", "--out", str(tmp_path / "capture")]
+    status = main([*words, "--gates"])
+    output = capsys.readouterr().out
+    assert status in (0, 1) and "mean garment" in output and "chaos floor" in output and "test_recombined" in output
+    assert ("FAIL" in output) == (status == 1) and not list(tmp_path.rglob("*.png"))
+    assert main(words) == 0
+    assert "simulating" not in capsys.readouterr().err
 
 
 def test_without_a_folder_it_films_into_the_cache(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):

@@ -3,14 +3,17 @@
 Symbols: S texels along the side of an atlas; a Map is [H, W], a ColourMap [H, W, 3]. Metres, linear reflectance.
 """
 
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32, Int
 from PIL import Image
+from scipy.spatial import cKDTree
 
+from mitsuba_avatar.body.rig import Topology
 from mitsuba_avatar.body.uv import UvAtlas
 from mitsuba_avatar.filming.anatomy import Anatomy, smooth_step
 from mitsuba_avatar.filming.clothing import DressedBody
@@ -20,45 +23,87 @@ ColourMap = Float[np.ndarray, "H W 3"]
 Colour = tuple[float, float, float]
 
 
-class Canvas:
-    """A dressed body's atlas, ready to be painted on.
+@dataclass(frozen=True, eq=False)  # arrays have no truth value to compare by
+class Surface:
+    """A mesh to be painted, tied to the body.
 
     Attributes:
-        anatomy, body: who is painted.
+        topology: triangles and texture atlas.
+        points: [P, 3] where on the resting body each vertex lies, metres.
+        body_vertices: [P] the body's vertex that each vertex takes the body's fields from.
+    """
+
+    topology: Topology
+    points: Float32[np.ndarray, "P 3"]
+    body_vertices: Int[np.ndarray, "P"]
+
+    @classmethod
+    def of_body(cls, anatomy: Anatomy, body: DressedBody) -> "Surface":
+        """All of a dressed body."""
+        return cls(anatomy.rig.topology, body.skin, np.arange(len(body.skin)))
+
+    @classmethod
+    def of_garment(cls, anatomy: Anatomy, topology: Topology, rest_vertices: Float32[np.ndarray, "P 3"]) -> "Surface":
+        """A mesh of its own, worn on the resting body: fields are those of the nearest vertex of the skin."""
+        skin = np.flatnonzero(anatomy.piece == 0)
+        return cls(topology, rest_vertices, skin[cKDTree(anatomy.rig.rest_vertices[skin]).query(rest_vertices)[1]])
+
+    @classmethod
+    def of_part(cls, anatomy: Anatomy, faces: Bool[np.ndarray, "F"]) -> "Surface":
+        """Some faces of the body with an atlas of their own: their charts, enlarged to fill it."""
+        topology = anatomy.rig.topology
+        body_vertices, own_faces = np.unique(topology.faces[faces], return_inverse=True)
+        used, own_uv_faces = np.unique(topology.uv_faces[faces], return_inverse=True)
+        uv = topology.uv[used]
+        low, high = uv.min(axis=0), uv.max(axis=0)
+        enlarged = 0.01 + 0.98 * (uv - low) / (high - low)  # leaves room for what a lookup at the border reads
+        own = Topology(len(body_vertices), own_faces.reshape(-1, 3), enlarged.astype(np.float32), own_uv_faces.reshape(-1, 3))
+        return cls(own, anatomy.rig.rest_vertices[body_vertices], body_vertices)
+
+
+class Canvas:
+    """A surface's atlas, ready to be painted on.
+
+    Attributes:
+        anatomy: of the body that the surface belongs to.
         size: S.
-        points: [S, S, 3] rest position of the bare skin under each texel, metres.
+        points: [S, S, 3] rest position under each texel, metres.
         rng: source of all random patterns; every use advances it.
     """
 
-    def __init__(self, anatomy: Anatomy, body: DressedBody, size: int, seed: int):
-        self.anatomy, self.body, self.size = anatomy, body, size
+    def __init__(self, anatomy: Anatomy, surface: Surface, size: int, seed: int):
+        self.anatomy, self.size = anatomy, size
         self.rng = np.random.default_rng(seed)
-        self._atlas = UvAtlas(anatomy.rig.topology, size)
-        self.points = self.texels(body.skin)
+        self._atlas = UvAtlas(surface.topology, size)
+        self._body_vertices = surface.body_vertices
+        self.points = self._interpolated(surface.points)
 
-    def texels(self, values: Float[np.ndarray, "V C"]) -> Float[np.ndarray, "S S C"]:
-        """Vertex values at every texel."""
+    def field(self, values: Float[np.ndarray, "V"]) -> Map:
+        """One value of each of the body's vertices at every texel."""
+        return self._interpolated(values[self._body_vertices, None])[..., 0]
+
+    def _interpolated(self, values: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "S S C"]:
         maps = self._atlas.texels_from_vertices(torch.from_numpy(values.astype(np.float32))[None])[0]
         return maps.permute(1, 2, 0).numpy().astype(np.float64)
 
-    def field(self, values: Float[np.ndarray, "V"]) -> Map:
-        """One vertex value at every texel."""
-        return self.texels(values[:, None])[..., 0]
-
-    def noise(self, wavelength: float, stretch: Colour = (1.0, 1.0, 1.0), waves: int = 20) -> Map:
+    def noise(
+        self, wavelength: float, stretch: Colour = (1.0, 1.0, 1.0), waves: int = 20, places: Float[np.ndarray, "S S 3"] | None = None
+    ) -> Map:
         """Band-limited noise over the surface, zero mean, unit variance: random plane waves.
 
         Args:
             wavelength: about that of the waves, metres.
             stretch: factors on the axes; below 1 the pattern is drawn out along that axis.
             waves: how many are summed.
+            places: metres in which the waves travel; None means the rest positions.
         """
+        places = self.points if places is None else places
         directions = self.rng.normal(size=(waves, 3))
         directions *= (self.rng.uniform(0.7, 1.4, waves) / np.linalg.norm(directions, axis=1))[:, None] * np.array(stretch)
         phases = self.rng.uniform(0, 2 * np.pi, waves)
         total = np.zeros((self.size, self.size))
         for direction, phase in zip(directions, phases, strict=True):  # one wave at a time keeps memory at one map
-            total += np.cos(self.points @ (2 * np.pi / wavelength * direction) + phase)
+            total += np.cos(places @ (2 * np.pi / wavelength * direction) + phase)
         return total / np.sqrt(waves / 2)
 
     def blob(self, centre: Float[np.ndarray, "3"], radius: float) -> Map:

@@ -11,6 +11,7 @@ from mitsuba_avatar.files import atomic_path
 
 COLUMNS = 13
 CAPTION = 14  # pixels under each picture
+TALLEST = 256  # pixels; larger images are shown smaller
 
 
 def save_contact_sheet(capture: Capture, path: Path) -> None:
@@ -31,10 +32,12 @@ def save_contact_sheet(capture: Capture, path: Path) -> None:
 
 def _captioned(capture: Capture, name: str, index: int) -> UInt8[np.ndarray, "H W 3"]:
     """An image with camera, frame and split under it."""
-    pixels = capture.encoded_image(name, index)
-    picture = Image.new("RGB", (pixels.shape[1], pixels.shape[0] + CAPTION))
-    picture.paste(Image.fromarray(pixels))
+    image = Image.fromarray(capture.encoded_image(name, index))
+    if image.height > TALLEST:
+        image = image.resize((max(1, round(image.width * TALLEST / image.height)), TALLEST), Image.Resampling.BOX)
+    picture = Image.new("RGB", (image.width, image.height + CAPTION))
+    picture.paste(image)
     frame = capture.frames[index]
     font = ImageFont.load_default(size=10)
-    ImageDraw.Draw(picture).text((3, pixels.shape[0] + 1), f"{name} {frame.split} {frame.number}", font=font, fill=(200, 200, 200))
+    ImageDraw.Draw(picture).text((3, image.height + 1), f"{name} {frame.split} {frame.number}", font=font, fill=(200, 200, 200))
     return np.asarray(picture)

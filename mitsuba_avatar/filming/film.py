@@ -1,65 +1,51 @@
 """Filming: from settings to a capture on disk. Interrupted filming goes on where it stopped; the same settings give the same capture.
 
-    settings -> rig, clothes, paint -> motion -> surface of every frame -> cameras -> images frame by frame
+    settings -> person -> motion -> simulated garment -> surfaces of a frame -> cameras -> images
 
-The surface that is filmed is kept as `vertices.npy`: the registered mesh is the truth. The capture's rig has the dressed person's mean
-rest shape over the training frames as its template, so that skinning the template alone already fits the clothes on average.
+Images may be made in any order and by several processes, each with its shard; the process that finds all of them made finishes the
+capture. What made them is kept in `truth/`, which no reader of captures opens. The capture's rig has the dressed person's mean rest shape
+over the training frames as its template, so that skinning the template alone already fits the clothes on average.
 """
 
 import dataclasses
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass
+import tempfile
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from numpy.lib.format import open_memmap
 
-from mitsuba_avatar.body.anny_rig import build_anny_rig, facial_action_displacements
 from mitsuba_avatar.body.driving import face_keypoints
 from mitsuba_avatar.body.rig import Rig, save_rig
 from mitsuba_avatar.body.skeleton import Skeleton
-from mitsuba_avatar.body.skinning import pose_vertices
+from mitsuba_avatar.captures.arrays import save_frame_array
 from mitsuba_avatar.captures.colour import decode_bytes, encode_bytes
 from mitsuba_avatar.captures.description import CaptureDescription
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.captures.writer import CaptureWriter
-from mitsuba_avatar.files import cache_folder
-from mitsuba_avatar.filming.anatomy import Anatomy
-from mitsuba_avatar.filming.appearance import Appearance, paint
+from mitsuba_avatar.files import atomic_path, cache_folder
 from mitsuba_avatar.filming.cameras import DomeCameras, place_cameras
-from mitsuba_avatar.filming.clothing import dress, hair, shirt, trousers
+from mitsuba_avatar.filming.capture_info import log_filming, measure_gates, write_info
+from mitsuba_avatar.filming.colour_chart import film_charts
 from mitsuba_avatar.filming.contact_sheet import save_contact_sheet
-from mitsuba_avatar.filming.motion import Motion, perform
+from mitsuba_avatar.filming.hidden_state import HiddenState
+from mitsuba_avatar.filming.performance import Performance
+from mitsuba_avatar.filming.person import with_template
+from mitsuba_avatar.filming.plan import Shard
+from mitsuba_avatar.filming.sensor import Sensor
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.filming.stage import Stage
-from mitsuba_avatar.filming.wrinkles import KinematicCloth
+from mitsuba_avatar.filming.tracking_noise import tracking_noise
+from mitsuba_avatar.filming.truth import TRUTH_FOLDER, OcclusionTruth, write_truth
 from mitsuba_avatar.resources import find_resource
 
-FILMING_VERSION = 4  # raised when what filming makes of the same settings changes, so that older cached captures are not taken
-PERSONS: dict[str, Callable[[], Rig]] = {"anny": build_anny_rig}
+FILMING_VERSION = 5  # raised when what filming makes of the same settings changes, so that older cached captures are not taken
 CONTACT_SHEET = "contact_sheet.png"
-Progress = Callable[[int, int], None]  # frames done, frames in all
-
-
-@dataclass(frozen=True)
-class Performance:
-    """Everything that is in front of the cameras, frame by frame.
-
-    Attributes:
-        rig: with the dressed mean rest shape as template.
-        appearance: textures of the person.
-        motion: frames, pose angles, root, facial actions.
-        rest_vertices: [N, V, 3] surface before skinning: clothes, folds and facial movement. Metres.
-        vertices: [N, V, 3] posed surface, world axes.
-    """
-
-    rig: Rig
-    appearance: Appearance
-    motion: Motion
-    rest_vertices: Float32[np.ndarray, "N V 3"]
-    vertices: Float32[np.ndarray, "N V 3"]
+OUTLINE_FRAMES = 200  # that decide where cameras look
+Progress = Callable[[str, int, int], None]  # what is done, steps done, steps in all
 
 
 def default_capture_path(settings: StudioSettings) -> Path:
@@ -68,95 +54,172 @@ def default_capture_path(settings: StudioSettings) -> Path:
     return cache_folder() / "captures" / f"{settings.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 
 
-def stage_performance(settings: StudioSettings) -> Performance:
-    """Dress, paint and move the person; nothing is rendered."""
-    bare = PERSONS[settings.person]()
-    anatomy = Anatomy.of(bare)
-    top = shirt(anatomy)
-    body = dress(anatomy, (trousers(anatomy, top), top, hair(anatomy)))
-    names, displacements = facial_action_displacements()
-    motion = perform(bare, settings, names)
-    folds = KinematicCloth(anatomy, body, settings.seed).displacements(motion.theta, settings.motion.fps, motion.segments())
-    face = np.einsum("na,avc->nvc", motion.actions, displacements, optimize=True)
-    rest = (body.vertices + folds + face).astype(np.float32)
-    train = [index for index, frame in enumerate(motion.frames) if frame.split == "train"]
-    rig = dataclasses.replace(bare, rest_vertices=rest[train].mean(axis=0))
-    root, vertices = _on_floor(motion.root, _posed(rig, motion, rest))
-    appearance = paint(anatomy, body, settings.clothing.texture_size, settings.seed)
-    return Performance(rig, appearance, dataclasses.replace(motion, root=root), rest, vertices)
-
-
-def film_capture(settings: StudioSettings, folder: Path | str, progress: Progress | None = None) -> Capture:
-    """Film a capture into a folder, or finish one that was interrupted there.
+def film_capture(
+    settings: StudioSettings, folder: Path | str, progress: Progress | None = None, shard: Shard | None = None
+) -> Capture | None:
+    """Film a capture into a folder, or go on with one that was begun there.
 
     Args:
         settings: what to film.
         folder: new, or holding an unfinished capture of the same settings. A finished one of the same settings is returned as it is.
-        progress: called after every frame with the number of frames done and in all.
+        progress: called after every step of a long stage.
+        shard: which images to make; None makes all.
+
+    Returns:
+        the finished capture; None while images of other shards are missing.
 
     Raises:
         FileExistsError: if the folder holds something else.
+        ValueError: if a garment explodes; no image of its segment is made.
         OSError: no write permission, disk full.
     """
     folder = Path(folder)
     if (folder / "capture.yaml").is_file() and _filmed_with(folder) == _signature(settings):
         return Capture.open(folder)
     find_resource("scenes", settings.light.scene, ".xml")  # a wrong name is told before the work, not after
-    performance = stage_performance(settings)
-    dome = place_cameras(performance.vertices, settings)
-    writer = CaptureWriter(folder, _describe(performance.rig, dome, settings), dome.cameras, performance.motion.frames)
-    _write_arrays(writer, performance)
-    stage = Stage(performance.rig.topology, performance.appearance, list(dome.cameras.values()), settings)
-    total = len(performance.motion.frames)
-    backdrop = np.float32(_backdrop(settings))
-    for index in range(total):
-        if not all(writer.has_image(name, index) and writer.has_mask(name, index) for name in dome.cameras):
-            radiance, coverage = stage.shoot(performance.vertices[index], seed=settings.seed * 1_000_003 + index)
-            composed = radiance + (1 - coverage[..., None]) * backdrop
-            for name, image, mask in zip(dome.cameras, encode_bytes(composed, "srgb"), coverage, strict=True):
-                writer.write_mask(name, index, mask)
-                writer.write_image(name, index, image)
-        if progress is not None:
-            progress(index + 1, total)
-    capture = writer.finish()
-    save_contact_sheet(capture, folder / CONTACT_SHEET)
-    return capture
+    return _Filming(settings, folder, progress or _silent, shard or Shard()).run()
 
 
-def _posed(rig: Rig, motion: Motion, rest_vertices: Float32[np.ndarray, "N V 3"]) -> Float32[np.ndarray, "N V 3"]:
-    """The surface in the world, frame by frame: all at once would need memory for N x V blended transforms."""
-    weights = torch.from_numpy(rig.skinning_weights)
-    with torch.no_grad():
-        transforms = Skeleton(rig)(torch.from_numpy(motion.theta), torch.from_numpy(motion.root))
-        posed = [
-            pose_vertices(torch.from_numpy(rest)[None], transform[None], weights)
-            for rest, transform in zip(rest_vertices, transforms, strict=True)
-        ]
-    return torch.cat(posed).numpy()
+def rehearse(settings: StudioSettings, folder: Path | str, progress: Progress) -> tuple[HiddenState, dict[str, float]]:
+    """Simulate all garments of a capture, which `film_capture` finds in the folder, and measure what it could show; see `measure_gates`.
+
+    Raises:
+        as `film_capture`, and ValueError if there are no test frames to score on.
+    """
+    return measure_gates(_Filming(settings, Path(folder), progress, Shard()).performance, progress)
 
 
-def _on_floor(
-    root: Float32[np.ndarray, "N 4 4"], vertices: Float32[np.ndarray, "N V 3"]
-) -> tuple[Float32[np.ndarray, "N 4 4"], Float32[np.ndarray, "N V 3"]]:
-    """Root and surface, shifted so that the lowest point of every frame lies on z = 0, whatever ankles and toes do."""
-    lowest = vertices[..., 2].min(axis=1)
-    up = np.array([0, 0, 1], dtype=np.float32)
-    shifted = root.copy()
-    shifted[:, 2, 3] -= lowest
-    return shifted, vertices - lowest[:, None, None] * up
+def _silent(stage: str, done: int, total: int) -> None:
+    """Progress that nobody watches."""
 
 
-def _describe(rig: Rig, dome: DomeCameras, settings: StudioSettings) -> CaptureDescription:
+class _Filming:
+    """One process's part in filming a capture."""
+
+    def __init__(self, settings: StudioSettings, folder: Path, progress: Progress, shard: Shard):
+        self.settings, self.folder, self.progress = settings, folder, progress
+        self.performance = Performance(settings, folder / TRUTH_FOLDER)
+        count = len(self.performance)
+        outline = np.unique(np.linspace(0, count - 1, min(count, OUTLINE_FRAMES)).round().astype(int)).tolist()
+        self.dome = place_cameras(self.performance.body_outline(outline), settings)
+        rig = self.performance.person.rig
+        description = _describe(rig, self.performance.person.action_names, self.dome, settings)
+        self.writer = CaptureWriter(folder, description, self.dome.cameras, self.performance.motion.frames)
+        self.images = shard.images(count, len(self.dome.cameras))
+
+    def run(self) -> Capture | None:
+        """Simulate, film, and finish if nothing is missing then."""
+        started = time.perf_counter()
+        made = 0
+        try:
+            write_truth(self.folder, self.performance.person.layers, list(self.dome.cameras), self.settings)
+            self._simulate()
+            for _ in self._film():
+                made += 1
+            if self.settings.cameras.chart_samples_per_pixel and not (self.folder / "chart" / "chart.json").is_file():
+                film_charts(self.folder / "chart", self.dome.cameras, self.settings)
+        finally:
+            log_filming(self.folder / TRUTH_FOLDER, time.perf_counter() - started, made)
+        return self._finish() if self._is_all_there() else None
+
+    def _simulate(self) -> None:
+        """The garment of every segment that this shard shows."""
+        performance = self.performance
+        orders = performance.unsimulated(list(self.images))
+        total, before = performance.frames_of(orders), 0
+        for order in orders:
+            performance.simulate(order, lambda done, _, before=before: self.progress("simulating cloth", before + done, total))
+            before += performance.frames_of([order])
+
+    def _film(self) -> Iterator[int]:
+        """Make the images that are missing; yields after each frame."""
+        names, person = list(self.dome.cameras), self.performance.person
+        missing = {frame: [index for index in cameras if not self._has(names[index], frame)] for frame, cameras in self.images.items()}
+        if not any(missing.values()):
+            return
+        stage = Stage(person.layers, list(self.dome.cameras.values()), self.settings)
+        sensor, backdrop = Sensor.of(self.settings), np.float32(_backdrop(self.settings))
+        size = self.settings.light.occlusion_size
+        occlusion = OcclusionTruth(self.folder, person.rig.topology, size) if size else None
+        for done, (frame, cameras) in enumerate(missing.items()):
+            if cameras:
+                surfaces = self.performance.surfaces(frame)
+                if occlusion is not None:
+                    occlusion.write(frame, surfaces.registered)
+                radiance, coverage = stage.shoot(surfaces.layers, self.settings.seed * 1_000_003 + frame, cameras)
+                recorded = sensor.record(radiance + (1 - coverage[..., None]) * backdrop, frame, cameras)
+                for index, image, mask in zip(cameras, encode_bytes(recorded, "srgb"), coverage, strict=True):
+                    self.writer.write_mask(names[index], frame, mask)
+                    self.writer.write_image(names[index], frame, image)
+            self.progress("filming", done + 1, len(missing))
+            yield frame
+
+    def _has(self, camera: str, frame: int) -> bool:
+        return self.writer.has_image(camera, frame) and self.writer.has_mask(camera, frame)
+
+    def _is_all_there(self) -> bool:
+        """Whether every image of every shard is made."""
+        return all(self._has(name, frame) for name in self.dome.cameras for frame in range(len(self.performance)))
+
+    def _finish(self) -> Capture:
+        """Arrays, rig, figures; then the capture is declared whole."""
+        performance, writer = self.performance, self.writer
+        rig, count = performance.person.rig, len(performance)
+        train = [index for index, frame in enumerate(performance.motion.frames) if frame.split == "train"]
+        with tempfile.TemporaryDirectory(dir=self.folder / TRUTH_FOLDER) as scratch:
+            shape = (count, rig.topology.num_vertices, 3)
+            registered, rest = (open_memmap(f"{scratch}/{name}.npy", "w+", np.float32, shape) for name in ("registered", "rest"))
+            for frame in range(count):
+                surfaces = performance.surfaces(frame)
+                registered[frame], rest[frame] = surfaces.registered, surfaces.rest
+                self.progress("collecting surfaces", frame + 1, count)
+            dressed = with_template(rig, sum(rest[index].astype(np.float64) / len(train) for index in train).astype(np.float32))
+            self._write_arrays(dressed, registered, rest)
+            save_rig(writer.path / writer.description.rig, dressed)
+            write_info(self.folder, performance, rest)
+        capture = writer.finish()
+        save_contact_sheet(capture, self.folder / CONTACT_SHEET)
+        return capture
+
+    def _write_arrays(self, rig: Rig, registered: np.ndarray, rest: np.ndarray) -> None:
+        """Pose, face signal, keypoints and registered surface; where that has tracking noise, the exact one goes to the truth."""
+        settings, motion = self.settings, self.performance.motion
+        with torch.no_grad():
+            face = face_keypoints(rig, torch.from_numpy(rest)).numpy()
+            skeleton = Skeleton(rig)
+            joints = skeleton.posed_joints(skeleton(torch.from_numpy(motion.theta), torch.from_numpy(motion.root))).numpy()
+        joints = joints[:, rig.keypoint_joints]
+        keypoints = np.concatenate([joints, np.ones_like(joints[..., :1])], axis=-1)
+        if settings.motion.face_signal == "action_codes":
+            face = motion.actions
+        if settings.clothing.tracking_noise:
+            save_frame_array(self.folder / TRUTH_FOLDER, "vertices", registered, len(registered))
+            for order, segment in enumerate(motion.segments()):
+                exact = np.array(registered[segment])
+                registered[segment] = exact + tracking_noise(
+                    self.performance.person.anatomy,
+                    exact,
+                    [slice(0, len(exact))],
+                    settings.motion.fps,
+                    settings.clothing.tracking_noise,
+                    settings.seed + order,
+                )
+        with atomic_path(self.folder / TRUTH_FOLDER / "actions.npy") as temporary:
+            np.save(temporary, motion.actions)
+        self.writer.write_arrays(theta=motion.theta, root=motion.root, face=face, keypoints=keypoints, vertices=registered)
+
+
+def _describe(rig: Rig, action_names: tuple[str, ...], dome: DomeCameras, settings: StudioSettings) -> CaptureDescription:
     """What capture.yaml says."""
-    axes = [f"{name}_{axis}" for name in rig.face_keypoint_names for axis in "xyz"]
+    axes = tuple(f"{name}_{axis}" for name in rig.face_keypoint_names for axis in "xyz")
     return CaptureDescription(
         name=settings.name,
         fps=settings.motion.fps,
         colour_curve="srgb",
         lighting={"scene": settings.light.scene},
         background=(_backdrop(settings),) * 3,
-        face_signal="keypoints",
-        face_names=tuple(axes),
+        face_signal=settings.motion.face_signal,
+        face_names=axes if settings.motion.face_signal == "keypoints" else action_names,
         keypoint_names=rig.keypoint_names,
         held_out_cameras=dome.held_out,
         licence="CC0-1.0",
@@ -176,17 +239,3 @@ def _signature(settings: StudioSettings) -> str:
 
 def _filmed_with(folder: Path) -> str:
     return Capture.open(folder).description.source
-
-
-def _write_arrays(writer: CaptureWriter, performance: Performance) -> None:
-    """Pose, face signal, keypoints, registered surface and rig."""
-    rig, motion = performance.rig, performance.motion
-    with torch.no_grad():
-        face = face_keypoints(rig, torch.from_numpy(performance.rest_vertices)).numpy()
-        skeleton = Skeleton(rig)
-        joints = skeleton.posed_joints(skeleton(torch.from_numpy(motion.theta), torch.from_numpy(motion.root))).numpy()[
-            :, rig.keypoint_joints
-        ]
-    keypoints = np.concatenate([joints, np.ones_like(joints[..., :1])], axis=-1)
-    writer.write_arrays(theta=motion.theta, root=motion.root, face=face, keypoints=keypoints, vertices=performance.vertices)
-    save_rig(writer.path / writer.description.rig, rig)

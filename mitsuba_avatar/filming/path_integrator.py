@@ -88,11 +88,14 @@ class SplitPathIntegrator(mi.SamplingIntegrator):
 
 
 def _towards_viewer(hit, ray):
-    """Bend a shading normal that faces away from the viewer until it just faces them; the surface would be black there."""
+    """Bend a shading normal that lies on the other side of the viewer than the surface's until it just faces as the surface does.
+
+    The surface would be black there. Seen from behind, only a two-sided surface scatters anything.
+    """
     viewer = -ray.d
-    cosine = dr.dot(hit.sh_frame.n, viewer)
-    missing = dr.select(dr.dot(hit.n, viewer) > 0, dr.maximum(SMALLEST_COSINE - cosine, 0), 0)
-    hit.sh_frame = mi.Frame3f(dr.normalize(hit.sh_frame.n + missing * viewer))
+    side = dr.mulsign(mi.Float(1), dr.dot(hit.n, viewer))
+    missing = dr.maximum(SMALLEST_COSINE - side * dr.dot(hit.sh_frame.n, viewer), 0)
+    hit.sh_frame = mi.Frame3f(dr.normalize(hit.sh_frame.n + side * missing * viewer))
     hit.wi = hit.to_local(viewer)
     return hit
 

@@ -6,9 +6,9 @@ The person's left is +X, front is -Y; heights on the shirt count from the pelvis
 import numpy as np
 
 from mitsuba_avatar.filming.anatomy import ARM, LEG, SIDES, smooth_step
-from mitsuba_avatar.filming.canvas import Canvas, Map, Paint, bands, within
+from mitsuba_avatar.filming.canvas import Canvas, Colour, Map, Paint, bands, within
 
-HAIR = (0.070, 0.042, 0.027)
+HAIR = (0.046, 0.027, 0.018)
 SHIRT = (0.50, 0.46, 0.36)
 STRIPES = (0.085, 0.16, 0.27)
 EMBLEM = (0.55, 0.13, 0.055)
@@ -55,11 +55,44 @@ def paint_trousers(canvas: Canvas) -> Paint:
     return paint
 
 
+def paint_skirt(canvas: Canvas) -> Paint:
+    """Dark cloth with upright pinstripes, a broad light band above the hem, a patch on the left."""
+    angle, height = around_pelvis(canvas)
+    weave = 1 + 0.08 * canvas.noise(0.007)
+    paint = Paint(np.array(TROUSERS) * weave[..., None], np.full_like(weave, 0.85))
+    paint = paint.over(WORN, 0.7 * bands(angle, period=2 * np.pi / 22, fill=0.18))
+    paint = paint.over(PIPING, within(np.abs(height + 0.36), 0.02, EDGE))
+    return paint.over(PATCH, within(np.abs(height + 0.16), 0.055, EDGE) * within(np.abs(angle - 0.6), 0.3, 0.04))
+
+
 def paint_hair(canvas: Canvas) -> Paint:
-    """Strands combed back from the forehead."""
-    along = (1.0, 0.12, 0.35)
-    strands = 1 + 0.28 * canvas.noise(0.004, stretch=along) + 0.15 * canvas.noise(0.012, stretch=along)
-    return Paint(np.array(HAIR) * np.clip(strands, 0.4, 2.2)[..., None], np.full_like(strands, 0.45))
+    """Dark strands."""
+    return strands(canvas, HAIR)
+
+
+def strands(canvas: Canvas, colour: Colour) -> Paint:
+    """Strands that fan out from the crown over the head, in locks."""
+    anatomy, points = canvas.anatomy, canvas.points
+    centre = 0.5 * (anatomy.joint("eye.L") + anatomy.joint("eye.R")) + np.array([0, 0.085, 0.03])
+    crown = np.array([0.1, 0.45, 1.0]) / np.linalg.norm([0.1, 0.45, 1.0])
+    offset = points - centre
+    offset /= np.linalg.norm(offset, axis=-1, keepdims=True).clip(1e-6)
+    sideways = offset - (offset @ crown)[..., None] * crown
+    meridian = sideways / np.linalg.norm(sideways, axis=-1, keepdims=True).clip(1e-6)
+    along = np.arccos(np.clip(offset @ crown, -1, 1))[..., None] * crown
+    # On a sphere of the head's size, 0.1 metres; along a strand the pattern changes thirty times more slowly than across it.
+    parted = smooth_step(np.linalg.norm(sideways, axis=-1), 0.15, 0.6)  # at the crown, meridians run together
+    fine = parted * canvas.noise(0.0055, places=0.1 * (meridian + 0.05 * along))
+    locks = canvas.noise(0.013, places=0.1 * (meridian + 0.15 * along)) + 0.5 * canvas.noise(0.03)
+    shade = np.clip(1 + 0.26 * fine + 0.18 * locks, 0.35, 2.2)
+    # Rough, or the dome would shine grey on the whole outline of the head.
+    return Paint(np.array(colour) * shade[..., None], np.clip(0.80 - 0.10 * fine - 0.05 * locks, 0.55, 1))
+
+
+def around_pelvis(canvas: Canvas) -> tuple[Map, Map]:
+    """Angle about the vertical through the pelvis, 0 in front and positive towards the person's left, and height above it, metres."""
+    offset = canvas.points - canvas.anatomy.joint("spine05")
+    return np.arctan2(offset[..., 0], -offset[..., 1]), offset[..., 2]
 
 
 def _emblem(points: np.ndarray, x: float, z: float) -> Map:

@@ -14,11 +14,11 @@ LIPS = (0.40, 0.145, 0.125)
 LIDS = (0.345, 0.124, 0.094)
 MOUTH = (0.20, 0.055, 0.050)
 NAILS = (0.56, 0.36, 0.29)
-BROWS = (0.070, 0.042, 0.027)
+BROWS = (0.055, 0.033, 0.022)
 SCLERA = (0.55, 0.52, 0.49)
-IRIS = (0.075, 0.055, 0.038)
+IRIS = (0.105, 0.062, 0.034)
 PUPIL = (0.02, 0.02, 0.02)
-IRIS_EDGE, PUPIL_EDGE = 0.72, 0.29  # radians from the direction of sight; larger than life, so that gaze shows in small images
+IRIS_EDGE, PUPIL_EDGE = 0.45, 0.18  # radians from the direction of sight; a little larger than life, so that gaze shows in small images
 
 
 def paint_skin(canvas: Canvas) -> Paint:
@@ -39,9 +39,8 @@ def paint_skin(canvas: Canvas) -> Paint:
     paint = paint.over(LIPS, 0.65 * canvas.mask("lips"), roughness=0.38)
     paint = paint.over(NAILS, 0.8 * np.maximum(canvas.mask("fingernails"), canvas.mask("toenails")), roughness=0.3)
     paint = paint.over(MOUTH, np.maximum(canvas.mask("inside-mouth"), canvas.field((anatomy.piece == 1).astype(np.float64))))
-    for side in SIDES:
-        paint = _paint_eye(canvas, paint, side)
-    return paint
+    is_eye = np.isin(anatomy.piece, eye_pieces(anatomy))
+    return paint.under(paint_eyes(canvas), canvas.field(is_eye.astype(np.float64)))
 
 
 def _between_eyes(anatomy: Anatomy) -> np.ndarray:
@@ -62,9 +61,11 @@ def _brows(canvas: Canvas, across: Map, back: Map, up: Map) -> Map:
     side = np.abs(across)
     rise = 0.006 * np.sin(np.clip((side - 0.012) / 0.045, 0, 1) * np.pi * 0.75)
     arc = 0.0235 + 0.0011 * np.sign(across) + rise - 0.06 * np.clip(side - 0.043, 0, None)
-    width = 0.0042 * smooth_step(side, 0.062, 0.035) + 0.0008
-    along = smooth_step(side, 0.011, 0.017) * smooth_step(side, 0.060, 0.052)
-    strands = 0.75 + 0.25 * canvas.noise(0.003, stretch=(1.0, 1.0, 0.4))
+    width = 0.0040 * smooth_step(side, 0.064, 0.030) + 0.0008
+    along = smooth_step(side, 0.010, 0.019) * smooth_step(side, 0.062, 0.050)
+    # Hairs lean outwards: they run across and up.
+    lean = np.stack([side - 0.9 * up, np.zeros_like(side), 0.15 * (up + 0.9 * side)], axis=-1)
+    strands = 0.84 + 0.20 * canvas.noise(0.0028, places=lean)
     return np.clip(along * np.exp(-(((up - arc) / width) ** 2)) * strands * (back < 0.04), 0, 1)
 
 
@@ -77,23 +78,26 @@ def _lash_line(canvas: Canvas) -> Map:
     return rim
 
 
-def _paint_eye(canvas: Canvas, paint: Paint, side: str) -> Paint:
-    """White, iris and pupil by the angle from the direction of sight, which at rest is -Y."""
-    anatomy = canvas.anatomy
-    centre = anatomy.joint(f"eye.{side}")
-    pieces = [piece for piece in range(1, anatomy.piece.max() + 1) if _is_around(anatomy, piece, centre)]
-    for piece in pieces:
-        offset = canvas.points - centre
-        distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-6)  # of the centre itself the angle means nothing
-        angle = np.arccos(np.clip(-offset[..., 1] / distance, -1, 1))
-        white = np.array(SCLERA) * (1 - 0.12 * smooth_step(angle, 0.5, 1.2))[..., None]
-        eye = Paint(white, np.full_like(angle, 0.12))
-        eye = eye.over(IRIS, smooth_step(angle, IRIS_EDGE + 0.12, IRIS_EDGE - 0.12))
-        eye = eye.over(PUPIL, smooth_step(angle, PUPIL_EDGE + 0.07, PUPIL_EDGE - 0.07))
-        paint = paint.under(eye, canvas.field((anatomy.piece == piece).astype(np.float64)))
-    return paint
+def paint_eyes(canvas: Canvas) -> Paint:
+    """Both eyeballs: white, iris and pupil by the angle from the direction of sight, which at rest is -Y."""
+    left, right = (canvas.anatomy.joint(f"eye.{side}") for side in SIDES)
+    centre = np.where(canvas.points[..., :1] > 0, left, right)
+    offset = canvas.points - centre
+    distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-6)  # of the centre itself the angle means nothing
+    angle = np.arccos(np.clip(-offset[..., 1] / distance, -1, 1))
+    spokes = np.stack([offset[..., 0], 0.1 * angle, offset[..., 2]], axis=-1) / np.hypot(offset[..., 0], offset[..., 2])[..., None].clip(
+        1e-5
+    )
+    eye = Paint(np.array(SCLERA) * (1 - 0.12 * smooth_step(angle, 0.6, 1.3))[..., None], np.full_like(angle, 0.07))
+    eye = eye.over(LIDS, 0.35 * smooth_step(angle, 0.75, 1.35))  # vessels towards the lids
+    streaks = np.clip(1 + 0.35 * canvas.noise(0.35, places=spokes), 0.4, 1.8)
+    iris = np.array(IRIS) * (streaks * (1.35 - 0.7 * smooth_step(angle, 0.30, IRIS_EDGE)))[..., None]
+    eye = eye.over(iris, smooth_step(angle, IRIS_EDGE + 0.03, IRIS_EDGE - 0.03))
+    return eye.over(PUPIL, smooth_step(angle, PUPIL_EDGE + 0.02, PUPIL_EDGE - 0.02))
 
 
-def _is_around(anatomy: Anatomy, piece: int, centre: np.ndarray) -> bool:
-    """Whether a piece of the surface is the ball around an eye's joint."""
-    return bool(np.linalg.norm(anatomy.rig.rest_vertices[anatomy.piece == piece].mean(axis=0) - centre) < 0.02)
+def eye_pieces(anatomy: Anatomy) -> tuple[int, ...]:
+    """Which pieces of the surface are eyeballs."""
+    centres = [anatomy.joint(f"eye.{side}") for side in SIDES]
+    middles = {piece: anatomy.rig.rest_vertices[anatomy.piece == piece].mean(axis=0) for piece in range(1, anatomy.piece.max() + 1)}
+    return tuple(piece for piece, middle in middles.items() if min(np.linalg.norm(middle - centre) for centre in centres) < 0.02)

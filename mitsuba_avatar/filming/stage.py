@@ -1,73 +1,178 @@
-"""The stage in Mitsuba: dome, person and all cameras, built once; each frame moves the person's vertices and shoots every camera at once.
+"""The stage in Mitsuba: the dome and what stands in it, built once; each frame moves the vertices and every camera takes an image.
 
-The person's mesh is split at texture seams, because Mitsuba interpolates texture coordinates per vertex; normals are computed on the
-welded mesh and copied, so that shading crosses seams. (Differentiable rendering must not do this; filming takes no gradients.)
+What stands there comes in *layers* (the person, a garment, a headset), each a mesh with paint of its own. A layer's mesh is split at
+texture seams, because Mitsuba interpolates texture coordinates per vertex; normals are computed on the welded mesh and copied, so that
+shading crosses seams. (Differentiable rendering must not do this; filming takes no gradients.)
 A scene is never rebuilt: rebuilding leaks memory (mitsuba3 issue 1890).
 """
 
-import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from mitsuba_avatar.body.mesh import vertex_normals
 from mitsuba_avatar.body.rig import Topology
 from mitsuba_avatar.captures.cameras import Camera
 from mitsuba_avatar.filming.appearance import Appearance
+from mitsuba_avatar.filming.exposure import Exposure, visible_pixels
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.resources import find_resource
 
-SPECULAR = 0.35  # of the principled BSDF: reflectance 0.028 at normal incidence, as of skin
 SPECULAR_SAMPLES = 0.12  # share of samples for the specular lobe; the default of a half doubles the noise of the diffuse one
 
 
-class Stage:
-    """A Mitsuba scene with one person in it, seen by all cameras of a capture. Call `rendering.backend.select_variant` before."""
+@dataclass(frozen=True, eq=False)  # arrays have no truth value to compare by
+class Layer:
+    """One mesh on the stage.
 
-    def __init__(self, topology: Topology, appearance: Appearance, cameras: Sequence[Camera], settings: StudioSettings):
-        """Load the settings' scene file and put person and cameras into it.
+    Attributes:
+        name: unique on its stage; letters, digits and '_'.
+        topology: triangles and texture atlas.
+        appearance: textures over that atlas.
+        is_two_sided: whether the inner side is seen and painted like the outer one; cloth is, closed surfaces need not be.
+        hidden_faces: [F] faces left out of the images (skin under a garment that would poke through); None shows all. Normals are
+            those of the whole mesh.
+    """
+
+    name: str
+    topology: Topology
+    appearance: Appearance
+    is_two_sided: bool = False
+    hidden_faces: Bool[np.ndarray, "F"] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.topology.faces)
+        if self.hidden_faces is not None and (len(self.hidden_faces) != count or self.hidden_faces.all()):
+            raise ValueError(
+                f"Layer(): hidden_faces of {self.name!r} must be one flag for each of {count} faces, not all set; got "
+                f"{len(self.hidden_faces)} flags, {int(self.hidden_faces.sum())} set. Leave out a layer that is not seen at all."
+            )
+
+
+class Stage:
+    """A Mitsuba scene with a person in it, seen by the cameras of a capture. Call `rendering.backend.select_variant` before."""
+
+    def __init__(self, layers: Sequence[Layer], cameras: Sequence[Camera], settings: StudioSettings):
+        """Load the settings' scene file and put the layers into it.
 
         Raises:
             FileNotFoundError: if there is no such scene.
-            ValueError: if cameras differ in size or have distortion.
+            ValueError: if two layers have one name, or cameras differ in size or have distortion.
         """
         # Registers `split_path`. Here, because its base class exists only once a variant is chosen.
         import mitsuba_avatar.filming.path_integrator  # noqa: F401
 
-        self.width, self.height, self.count = cameras[0].width, cameras[0].height, len(cameras)
-        self.samples_per_pixel = settings.light.samples_per_pixel
-        corners = np.stack([topology.faces.reshape(-1), topology.uv_faces.reshape(-1)], axis=1)
-        pairs, corner_pair = np.unique(corners, axis=0, return_inverse=True)  # [S, 2] vertex and uv of each split vertex
-        self.welded = pairs[:, 0]
-        self.faces = torch.from_numpy(topology.faces)
-
+        _check(layers, cameras)
+        self.cameras = tuple(cameras)
+        self._meshes = [_StagedMesh(layer) for layer in layers]
         file = find_resource("scenes", settings.light.scene, ".xml")
-        parts = _parts_of(file, settings) | {"person": _mesh(topology, appearance, pairs, corner_pair.reshape(-1, 3))}
-        self.scene = mi.load_dict({"type": "scene", **parts})
-        self.sensor = mi.load_dict(_batch_sensor(cameras, settings))
-        self.parameters = mi.traverse(self.scene)
+        parts = _parts_of(file, settings)
+        self._has_objects = any(isinstance(part, mi.Shape) for part in parts.values())  # these may be anywhere in the image
+        meshes = {mesh.layer.name: mesh.shape for mesh in self._meshes}
+        self._exposure = Exposure(mi.load_dict({"type": "scene", **parts, **meshes}), settings.light.samples_per_pixel)
+        self._parameters = mi.traverse(self._exposure.scene)
 
-    def shoot(self, vertices: Float32[np.ndarray, "V 3"], seed: int) -> tuple[Float32[np.ndarray, "C H W 3"], Float32[np.ndarray, "C H W"]]:
-        """Path-trace one frame from every camera.
+    def shoot(
+        self, vertices: Sequence[Float32[np.ndarray, "_ 3"]], seed: int, cameras: Sequence[int] | None = None
+    ) -> tuple[Float32[np.ndarray, "C H W 3"], Float32[np.ndarray, "C H W"]]:
+        """Path-trace one frame.
 
         Args:
-            vertices: [V, 3] posed surface, metres, world axes.
-            seed: of the sampler; another seed gives other noise.
+            vertices: [V, 3] posed surface of each layer, in the layers' order, metres, world axes.
+            seed: of the frame; another seed gives other noise. A camera's image depends on the seed and the camera's place among the
+                stage's cameras alone: any frames, cameras and order of them, in any process, give the same bits.
+            cameras: indices of the cameras to shoot; None means all.
 
         Returns:
-            radiance [C, H, W, 3] linear, black outside the person (premultiplied), and coverage [C, H, W] in 0..1.
+            radiance [C, H, W, 3] linear, black where no layer is seen (premultiplied), and coverage by all layers [C, H, W] in 0..1.
+
+        Raises:
+            ValueError: if the vertices are not those of the layers.
         """
-        normals = vertex_normals(torch.from_numpy(vertices)[None], self.faces)[0].numpy()
-        self.parameters["person.vertex_positions"] = vertices[self.welded].ravel()
-        self.parameters["person.vertex_normals"] = normals[self.welded].ravel()
-        self.parameters.update()
-        film = np.array(mi.render(self.scene, sensor=self.sensor, spp=self.samples_per_pixel, seed=seed))  # [H, C * W, 4]
-        views = film.reshape(self.height, self.count, self.width, 4).transpose(1, 0, 2, 3)
-        return np.ascontiguousarray(views[..., :3]), np.ascontiguousarray(views[..., 3]).clip(0, 1)
+        self._move(vertices)
+        chosen = range(len(self.cameras)) if cameras is None else cameras
+        images, pending = [], None
+        for index in chosen:
+            following = self._exposure.begin(self.cameras[index], self._pixels(index, vertices), (seed, index))
+            # One image is traced while Python prepares the next; more at once would only need memory.
+            images += [pending.finish()] if pending else []
+            pending = following
+        images += [pending.finish()] if pending else []
+        stacked = np.stack(images)
+        return np.ascontiguousarray(stacked[..., :3]), np.ascontiguousarray(stacked[..., 3])
+
+    def _move(self, vertices: Sequence[np.ndarray]) -> None:
+        """Carry every mesh to its place in a frame."""
+        expected = [mesh.layer.topology.num_vertices for mesh in self._meshes]
+        if [len(surface) for surface in vertices] != expected:
+            raise ValueError(
+                f"shoot(): expected vertices of {len(expected)} layers, {expected} of them; got {[len(surface) for surface in vertices]}. "
+                "Give the layers' surfaces in the order of the layers."
+            )
+        for mesh, surface in zip(self._meshes, vertices, strict=True):
+            normals = vertex_normals(torch.from_numpy(surface)[None], mesh.welded_faces)[0].numpy()
+            self._parameters[f"{mesh.layer.name}.vertex_positions"] = surface[mesh.welded].ravel()
+            self._parameters[f"{mesh.layer.name}.vertex_normals"] = normals[mesh.welded].ravel()
+        self._parameters.update()
+
+    def _pixels(self, index: int, vertices: Sequence[np.ndarray]) -> Bool[np.ndarray, "H W"]:
+        """Pixels that may see something."""
+        camera = self.cameras[index]
+        if self._has_objects:
+            return np.ones((camera.height, camera.width), dtype=bool)
+        pixels = np.zeros((camera.height, camera.width), dtype=bool)
+        for mesh, surface in zip(self._meshes, vertices, strict=True):
+            pixels |= visible_pixels(camera, surface, mesh.shown_faces)
+        return pixels
+
+
+class _StagedMesh:
+    """A layer as a Mitsuba mesh, split at seams, without positions yet.
+
+    Attributes:
+        layer: what it shows.
+        welded: [S] welded vertex of each split one.
+        welded_faces: all faces, for normals; shown_faces: [F', 3] the visible ones.
+        shape: Mitsuba's mesh.
+    """
+
+    def __init__(self, layer: Layer):
+        topology = layer.topology
+        shown = np.ones(len(topology.faces), dtype=bool) if layer.hidden_faces is None else ~layer.hidden_faces
+        corners = np.stack([topology.faces[shown].reshape(-1), topology.uv_faces[shown].reshape(-1)], axis=1)
+        pairs, corner_pair = np.unique(corners, axis=0, return_inverse=True)  # [S, 2] vertex and uv of each split vertex
+        self.layer = layer
+        self.welded = pairs[:, 0]
+        self.welded_faces = torch.from_numpy(topology.faces)
+        self.shown_faces = topology.faces[shown]
+
+        properties = mi.Properties()
+        properties["bsdf"] = mi.load_dict(_surface(layer))
+        faces = corner_pair.reshape(-1, 3)
+        mesh = mi.Mesh(layer.name, len(pairs), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties)
+        uv = topology.uv[pairs[:, 1]] * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)  # Mitsuba's v runs down the image
+        parameters = mi.traverse(mesh)
+        parameters["faces"] = faces.astype(np.uint32).ravel()
+        parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
+        parameters.update()
+        self.shape = mesh
+
+
+def _check(layers: Sequence[Layer], cameras: Sequence[Camera]) -> None:
+    """Layers must be told apart, images stacked."""
+    names = [layer.name for layer in layers]
+    if not names or len(set(names)) != len(names):
+        raise ValueError(f"Stage(): expected layers of different names; got {names}. Rename one.")
+    width, height = cameras[0].width, cameras[0].height
+    if any((camera.width, camera.height) != (width, height) or camera.is_distorted for camera in cameras):
+        raise ValueError(
+            "Stage(): expected cameras of one size and without distortion; got others. Give all cameras the size of the first."
+        )
 
 
 def _parts_of(file: Path, settings: StudioSettings) -> dict[str, object]:
@@ -83,62 +188,17 @@ def _parts_of(file: Path, settings: StudioSettings) -> dict[str, object]:
     return parts | {"integrator": scene.integrator()}
 
 
-def _mesh(topology: Topology, appearance: Appearance, pairs: np.ndarray, faces: np.ndarray) -> object:
-    """The person as a Mitsuba mesh, split at seams, without positions yet."""
+def _surface(layer: Layer) -> dict[str, object]:
+    """How a layer scatters light."""
 
     def texture(pixels: Float[np.ndarray, "S S C"]) -> dict[str, object]:
         return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(pixels)), "raw": True, "wrap_mode": "clamp"}
 
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(
-        {
-            "type": "principled",
-            "base_color": texture(appearance.base_colour),
-            "roughness": texture(appearance.roughness[..., None]),
-            "specular": SPECULAR,
-            "main_specular_sampling_rate": SPECULAR_SAMPLES,
-        }
-    )
-    mesh = mi.Mesh("person", len(pairs), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties)
-    uv = topology.uv[pairs[:, 1]] * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)  # Mitsuba's v runs down the image
-    parameters = mi.traverse(mesh)
-    parameters["faces"] = faces.astype(np.uint32).ravel()
-    parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
-    parameters.update()
-    return mesh
-
-
-def _batch_sensor(cameras: Sequence[Camera], settings: StudioSettings) -> dict[str, object]:
-    """All cameras side by side on one film: one launch a frame."""
-    width, height = cameras[0].width, cameras[0].height
-    if any((camera.width, camera.height) != (width, height) or camera.is_distorted for camera in cameras):
-        raise ValueError(
-            "Stage(): expected cameras of one size and without distortion; got others. Give all cameras the size of the first."
-        )
-    film = {"type": "hdrfilm", "pixel_format": "rgba", "component_format": "float32", "rfilter": {"type": "box"}}
-    sampler = {"type": "multijitter", "sample_count": settings.light.samples_per_pixel}
-    sensors = {camera.name: sensor_of(camera) | {"film": film | {"width": width, "height": height}} for camera in cameras}
-    return {"type": "batch", "film": film | {"width": width * len(cameras), "height": height}, "sampler": sampler, **sensors}
-
-
-def sensor_of(camera: Camera) -> dict[str, object]:
-    """A Mitsuba perspective sensor with a camera's intrinsics and pose, exact to 1e-4 pixels; film and sampler are the caller's.
-
-    Raises:
-        ValueError: for two different focal lengths, which Mitsuba's sensor does not have.
-    """
-    if abs(camera.fx / camera.fy - 1) > 1e-4:
-        raise ValueError(
-            f"sensor_of(): expected one focal length; {camera.name!r} has fx={camera.fx:.3f}, fy={camera.fy:.3f}. "
-            "Resample to square pixels."
-        )
-    return {
-        "type": "perspective",
-        "fov_axis": "x",
-        "fov": math.degrees(2 * math.atan(camera.width / (2 * camera.fx))),
-        "principal_point_offset_x": 0.5 - camera.cx / camera.width,
-        "principal_point_offset_y": 0.5 - camera.cy / camera.height,
-        "near_clip": 0.05,
-        "far_clip": 100.0,
-        "to_world": mi.ScalarTransform4f(camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+    principled = {
+        "type": "principled",
+        "base_color": texture(layer.appearance.base_colour),
+        "roughness": texture(layer.appearance.roughness[..., None]),
+        "specular": layer.appearance.specular,
+        "main_specular_sampling_rate": SPECULAR_SAMPLES,
     }
+    return {"type": "twosided", "bsdf": principled} if layer.is_two_sided else principled

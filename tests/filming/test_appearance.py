@@ -1,9 +1,10 @@
 import numpy as np
+import pytest
 
 from mitsuba_avatar.body.uv import texel_of_uv
 from mitsuba_avatar.filming.anatomy import Anatomy
-from mitsuba_avatar.filming.appearance import Appearance, paint
-from mitsuba_avatar.filming.canvas import Canvas, Paint, bands, within
+from mitsuba_avatar.filming.appearance import ATTIRES, Appearance, paint, paint_garment
+from mitsuba_avatar.filming.canvas import Canvas, Paint, Surface, bands, within
 from mitsuba_avatar.filming.clothing import DressedBody
 
 SIZE = 128
@@ -47,10 +48,48 @@ def test_paint_goes_over_and_under():
 
 
 def test_noise_has_zero_mean_and_unit_variance(anatomy: Anatomy, body: DressedBody):
-    noise = Canvas(anatomy, body, 64, seed=5).noise(0.01)
+    noise = Canvas(anatomy, Surface.of_body(anatomy, body), 64, seed=5).noise(0.01)
     assert abs(noise.mean()) < 0.15 and abs(noise.std() - 1) < 0.2
 
 
 def test_bands_and_edges():
     assert bands(np.array([[0.5, 0.0, 1.5]]), period=1.0, fill=0.4).tolist() == [[1, 0, 1]]
     np.testing.assert_allclose(within(np.array([[0.0, 1.0, 2.0]]), edge=1.0, softness=0.5), [[1, 0.5, 0]])
+
+
+def test_attires_differ_in_clothes_and_hair_and_agree_in_skin(anatomy: Anatomy, body: DressedBody):
+    first, second = (paint(anatomy, body, SIZE, 0, attire) for attire in ATTIRES)
+    places = {
+        "chest": anatomy.joint("spine01") + [-0.05, -0.12, 0],
+        "knee": anatomy.joint("lowerleg01.L") + [0, 0.1, 0],
+        "hair": anatomy.joint("eye.L") + [0, 0.05, 0.12],
+        "hand": anatomy.joint("finger3-1.L"),
+    }
+    difference = {
+        name: np.abs(_colour_at(anatomy, first, place) - _colour_at(anatomy, second, place)).max() for name, place in places.items()
+    }
+    assert min(difference[name] for name in ("chest", "knee", "hair")) > 0.08 and difference["hand"] == 0
+    with pytest.raises(ValueError, match=r"paint\(\): expected an attire of striped, leafy; got 'plain'"):
+        paint(anatomy, body, SIZE, 0, "plain")
+
+
+def test_a_garment_with_a_mesh_of_its_own_is_cloth_all_over(anatomy: Anatomy, body: DressedBody):
+    """On the body's own surface the garment's painter gives what the dressed body shows where the garment is."""
+    topology = anatomy.rig.topology
+    surface = Surface.of_garment(anatomy, topology, body.skin)
+    for attire in ATTIRES:
+        for name in ("shirt", "shorts", "skirt"):
+            cloth = paint_garment(anatomy, name, surface, 48, 0, attire)
+            assert cloth.roughness.min() > 0.6 and np.isfinite(cloth.base_colour).all()
+    chest = anatomy.joint("spine01") + [-0.05, -0.12, 0]
+    shirt = paint_garment(anatomy, "shirt", surface, SIZE, 0)
+    np.testing.assert_allclose(_colour_at(anatomy, shirt, chest), _colour_at(anatomy, paint(anatomy, body, SIZE, 0), chest), atol=0.12)
+    with pytest.raises(ValueError, match=r"paint_garment\(\): expected a garment of"):
+        paint_garment(anatomy, "hat", surface, SIZE, 0)
+
+
+def test_part_of_the_body_gets_its_charts_enlarged(anatomy: Anatomy):
+    faces = (anatomy.piece == 2)[anatomy.rig.topology.faces].all(axis=1)
+    part = Surface.of_part(anatomy, faces)
+    np.testing.assert_array_equal(part.points[part.topology.faces], anatomy.rig.rest_vertices[anatomy.rig.topology.faces[faces]])
+    assert 0 < part.topology.uv.min() < 0.02 and 0.98 < part.topology.uv.max() < 1

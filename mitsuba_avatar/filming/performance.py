@@ -1,0 +1,169 @@
+"""What happens in front of the cameras, frame by frame: made when it is asked for, so that memory does not grow with the frames.
+
+Simulated garments are the exception: they depend on all that went before in their segment. Each segment is simulated once, by whichever
+process needs it first, and kept as a file (`truth/garment_vertices/` of the capture), which others and later runs find there.
+
+Symbols: N frames, V body vertices, G garment vertices. Metres, world axes unless a name says rest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from mitsuba_avatar.body.skeleton import Skeleton
+from mitsuba_avatar.body.skinning import pose_vertices, unpose_vertices
+from mitsuba_avatar.files import atomic_path
+from mitsuba_avatar.filming.anatomy import FOOT, LEG
+from mitsuba_avatar.filming.cloth_simulation import BodyMotion, ClothSimulator
+from mitsuba_avatar.filming.motion import Motion, perform
+from mitsuba_avatar.filming.person import Person, dress_person
+from mitsuba_avatar.filming.settings import ClothingSettings, StudioSettings
+
+Progress = Callable[[int, int], None]  # frames done, frames in all
+ON_THE_FLOOR = (*FOOT, *LEG)  # parts of the body that may be the lowest
+
+
+@dataclass(frozen=True, eq=False)  # arrays have no truth value to compare by
+class Surfaces:
+    """One frame.
+
+    Attributes:
+        layers: vertices of each of the person's layers, posed.
+        registered: [V, 3] the exact registered mesh, posed; rest: [V, 3] the same with the skeleton's movement taken out.
+    """
+
+    layers: list[Float32[np.ndarray, "_ 3"]]
+    registered: Float32[np.ndarray, "V 3"]
+    rest: Float32[np.ndarray, "V 3"]
+
+
+class Performance:
+    """A person and what it does.
+
+    Attributes:
+        person: who.
+        motion: what, standing on the floor.
+        folder: where simulated garments are kept.
+    """
+
+    def __init__(self, settings: StudioSettings, folder: Path | str):
+        """Dress the person and plan its motion; nothing is simulated yet."""
+        self.settings = settings
+        self.folder = Path(folder)
+        self.person: Person = dress_person(settings)
+        rig = self.person.rig
+        self._skeleton, self._weights = Skeleton(rig), torch.from_numpy(rig.skinning_weights)
+        motion = perform(rig, settings, self.person.action_names)
+        self._states = self.person.cloth.states(motion.theta, settings.motion.fps, motion.segments())
+        self.motion: Motion = self._on_floor(motion)
+        self._segments = self.motion.segments()
+        self._garments: dict[int, Float32[np.ndarray, "n G 3"]] = {}
+
+    def __len__(self) -> int:
+        """Frames."""
+        return len(self.motion.frames)
+
+    def surfaces(self, frame: int) -> Surfaces:
+        """All surfaces of a frame. Simulates the frame's segment if nobody has.
+
+        Raises:
+            ValueError: if the garment explodes; names frame, segment and the setting to change.
+        """
+        person = self.person
+        moved = person.cloth.displacements(self._states[frame : frame + 1])[0]
+        moved = moved + np.einsum("a,avc->vc", self.motion.actions[frame], person.action_displacements)
+        filmed_rest = person.filmed.vertices + moved
+        if person.outfit is None:
+            rest = filmed_rest.astype(np.float32)
+            registered = self._posed(frame, rest)
+            body, garment = registered, []
+        else:
+            cloth = self.garment(frame)
+            body = self._posed(frame, (filmed_rest + person.under.inset).astype(np.float32))
+            registered = self._posed(frame, (person.registered.vertices + moved).astype(np.float32))
+            registered[person.outfit.mesh.body_vertices] = cloth[: len(person.outfit.mesh.body_vertices)]
+            rest = self._unposed(frame, registered)
+            garment = [cloth]
+        return Surfaces([body, *garment, *(part.surface(body) for part in person.parts)], registered, rest)
+
+    def garment(self, frame: int) -> Float32[np.ndarray, "G 3"]:
+        """The simulated garment in a frame."""
+        order = self._segment_of(frame)
+        if order not in self._garments:
+            if not self.garment_path(order).is_file():
+                self.simulate(order)
+            self._garments = {order: np.load(self.garment_path(order), mmap_mode="r")}  # one open file at a time
+        return np.array(self._garments[order][frame - self._segments[order].start])
+
+    def unsimulated(self, frames: list[int]) -> list[int]:
+        """Segments, by order, that hold some of these frames and are not simulated yet."""
+        if self.person.outfit is None:
+            return []
+        return [order for order in sorted({self._segment_of(frame) for frame in frames}) if not self.garment_path(order).is_file()]
+
+    def frames_of(self, orders: list[int]) -> int:
+        """How many frames some segments hold together."""
+        return sum(self._segments[order].stop - self._segments[order].start for order in orders)
+
+    def simulate(self, order: int, progress: Progress | None = None) -> None:
+        """Simulate the garment of a segment and keep it, whole or not at all.
+
+        Raises:
+            ValueError: as `surfaces`; nothing is kept.
+        """
+        vertices = self.simulated(order, self.settings.clothing, progress)
+        with atomic_path(self.garment_path(order)) as temporary:
+            np.save(temporary, vertices)
+
+    def simulated(self, order: int, clothing: ClothingSettings, progress: Progress | None = None) -> Float32[np.ndarray, "n G 3"]:
+        """The garment of a segment under other settings of the simulation; nothing is kept."""
+        person, segment = self.person, self._segments[order]
+        obstacle = person.outfit.obstacle + person.cloth.displacements(self._states[segment])
+        motion = BodyMotion(self.motion.theta[segment], self.motion.root[segment], self.settings.motion.fps, obstacle.astype(np.float32))
+        name, total = self.motion.frames[segment.start].segment, segment.stop - segment.start
+        frames = []
+        for vertices in ClothSimulator(person.rig, person.outfit, clothing).frames(motion, name, self.settings.seed + order):
+            frames.append(vertices)
+            if progress is not None:
+                progress(len(frames), total)
+        return np.stack(frames)
+
+    def garment_path(self, order: int) -> Path:
+        """File of a segment's garment."""
+        return self.folder / "garment_vertices" / f"{order:03d}_{self.motion.frames[self._segments[order].start].segment}.npy"
+
+    def body_outline(self, frames: list[int]) -> Float32[np.ndarray, "n v 3"]:
+        """Some vertices of the body in some frames, cheaply: where cameras must look."""
+        rest = self.person.registered.vertices
+        return np.stack([self._posed(frame, rest)[::7] for frame in frames])
+
+    def _on_floor(self, motion: Motion) -> Motion:
+        """The motion, shifted so that the lowest point of every frame is as high above the floor as it should be, whatever ankles do."""
+        anatomy = self.person.anatomy
+        feet = np.flatnonzero(anatomy.weight(ON_THE_FLOOR) > 0.5)
+        rest, weights = torch.from_numpy(self.person.filmed.vertices[feet])[None], self._weights[feet]
+        root = motion.root.copy()
+        with torch.no_grad():
+            for frame in range(len(root)):
+                transforms = self._transforms(motion, frame)
+                lowest = float(pose_vertices(rest, transforms, weights)[..., 2].min())
+                root[frame, 2, 3] += motion.clearance[frame] - lowest
+        return replace(motion, root=root)
+
+    def _segment_of(self, frame: int) -> int:
+        return next(order for order, segment in enumerate(self._segments) if segment.start <= frame < segment.stop)
+
+    def _transforms(self, motion: Motion, frame: int) -> torch.Tensor:
+        return self._skeleton(torch.from_numpy(motion.theta[frame : frame + 1]), torch.from_numpy(motion.root[frame : frame + 1]))
+
+    def _posed(self, frame: int, rest: Float32[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
+        with torch.no_grad():
+            return pose_vertices(torch.from_numpy(rest)[None], self._transforms(self.motion, frame), self._weights)[0].numpy()
+
+    def _unposed(self, frame: int, posed: Float32[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
+        with torch.no_grad():
+            return unpose_vertices(torch.from_numpy(posed)[None], self._transforms(self.motion, frame), self._weights)[0].numpy()

@@ -1,0 +1,98 @@
+"""What filming will cost, and how it is shared out: a capture's images in one order, cut into shards that any process may film.
+
+The cost is estimated from figures measured on two cores with Mitsuba's llvm variant; other machines differ, shares do not.
+"""
+
+import re
+from dataclasses import dataclass
+
+from mitsuba_avatar.filming.settings import StudioSettings
+
+SHARE_OF_PERSON = 0.32  # of an image's pixels: only these are traced
+PATHS_PER_SECOND = 1.7e6  # camera rays times paths that go on from them
+SECONDS_PER_IMAGE = 0.012  # whatever its size: preparing and writing it
+SECONDS_PER_PIXEL = 1.5e-7  # encoding
+SECONDS_PER_FRAME = 0.10  # surfaces and their occlusion
+SIMULATION_SECONDS = 0.15  # a frame of simulated cloth at ten frames a second
+BYTES_PER_PIXEL, BYTES_PER_FRAME = 1.1, 430_000  # PNG of image and mask; arrays and truth
+LONG = 48 * 3600.0  # seconds beyond which filming is refused without a shard
+
+
+@dataclass(frozen=True)
+class FilmingPlan:
+    """Numbers of a capture to be, and an estimate of its cost on two cores."""
+
+    frames: int
+    cameras: int
+    width: int
+    height: int
+    seconds: float
+    bytes: float
+
+    @property
+    def images(self) -> int:
+        """How many."""
+        return self.frames * self.cameras
+
+    def text(self) -> str:
+        """The plan in three lines."""
+        hours = self.seconds / 3600
+        duration = f"{self.seconds / 60:.1f} minutes" if hours < 1 else f"{hours:.1f} hours" if hours < 48 else f"{hours / 24:,.0f} days"
+        return (
+            f"{self.frames:,} frames from {self.cameras} cameras of {self.width} x {self.height} pixels: {self.images:,} images\n"
+            f"about {duration} on two cores, {self.bytes / 1e9:,.2f} GB\n"
+            f"a shard i/n films n-th parts of the images: --shard 0/{self.suggested_shards()} takes about an hour\n"
+        )
+
+    def suggested_shards(self) -> int:
+        """Shards of about an hour each."""
+        return max(1, round(self.seconds / 3600))
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part `index` of `count` of a capture's images."""
+
+    index: int = 0
+    count: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> "Shard":
+        """Read "i/n"; empty text is the whole.
+
+        Raises:
+            ValueError: for anything else, or i outside 0..n-1.
+        """
+        if not text:
+            return cls()
+        match = re.fullmatch(r"(\d+)/(\d+)", text)
+        if not match or not int(match[1]) < int(match[2]):
+            raise ValueError(f"Shard.parse(): expected i/n with 0 <= i < n; got {text!r}. Write --shard 0/4, for example.")
+        return cls(int(match[1]), int(match[2]))
+
+    def images(self, num_frames: int, num_cameras: int) -> dict[int, list[int]]:
+        """Frame -> indices of the cameras whose image of it belongs to this shard. Consecutive frames, so that few segments are needed."""
+        total = num_frames * num_cameras
+        chosen: dict[int, list[int]] = {}
+        for place in range(self.index * total // self.count, (self.index + 1) * total // self.count):
+            chosen.setdefault(place // num_cameras, []).append(place % num_cameras)
+        return chosen
+
+
+def plan_filming(settings: StudioSettings) -> FilmingPlan:
+    """The plan of a capture."""
+    motion, cameras, light = settings.motion, settings.cameras, settings.light
+    frames = motion.train_frames + motion.validation_frames + motion.test_frames + motion.stress_frames
+    count = cameras.train + cameras.held_out
+    pixels = cameras.width * cameras.height
+    paths = pixels * SHARE_OF_PERSON * light.samples_per_pixel * light.light_samples
+    per_image = paths / PATHS_PER_SECOND + SECONDS_PER_IMAGE + SECONDS_PER_PIXEL * pixels
+    per_frame = SECONDS_PER_FRAME + (SIMULATION_SECONDS * 10 / motion.fps if settings.clothing.is_simulated else 0)
+    return FilmingPlan(
+        frames=frames,
+        cameras=count,
+        width=cameras.width,
+        height=cameras.height,
+        seconds=frames * (count * per_image + per_frame),
+        bytes=frames * (count * pixels * BYTES_PER_PIXEL + BYTES_PER_FRAME),
+    )
