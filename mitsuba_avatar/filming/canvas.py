@@ -21,6 +21,7 @@ from mitsuba_avatar.filming.clothing import DressedBody
 Map = Float[np.ndarray, "H W"]
 ColourMap = Float[np.ndarray, "H W 3"]
 Colour = tuple[float, float, float]
+NEAREST = 6  # vertices of the skin that a garment's vertex lies between: fewer show as steps in what is painted by the body's fields
 
 
 @dataclass(frozen=True, eq=False)  # arrays have no truth value to compare by
@@ -30,23 +31,28 @@ class Surface:
     Attributes:
         topology: triangles and texture atlas.
         points: [P, 3] where on the resting body each vertex lies, metres.
-        body_vertices: [P] the body's vertex that each vertex takes the body's fields from.
+        body_vertices: [P, K] the body's vertices that each vertex takes the body's fields from.
+        weights: [P, K] how much of each; rows sum to 1.
     """
 
     topology: Topology
     points: Float32[np.ndarray, "P 3"]
-    body_vertices: Int[np.ndarray, "P"]
+    body_vertices: Int[np.ndarray, "P K"]
+    weights: Float[np.ndarray, "P K"]
 
     @classmethod
     def of_body(cls, anatomy: Anatomy, body: DressedBody) -> "Surface":
         """All of a dressed body."""
-        return cls(anatomy.rig.topology, body.skin, np.arange(len(body.skin)))
+        count = len(body.skin)
+        return cls(anatomy.rig.topology, body.skin, np.arange(count)[:, None], np.ones((count, 1)))
 
     @classmethod
     def of_garment(cls, anatomy: Anatomy, topology: Topology, rest_vertices: Float32[np.ndarray, "P 3"]) -> "Surface":
-        """A mesh of its own, worn on the resting body: fields are those of the nearest vertex of the skin."""
+        """A mesh of its own, worn on the resting body: fields are those of the skin's nearest vertices, the nearer the more."""
         skin = np.flatnonzero(anatomy.piece == 0)
-        return cls(topology, rest_vertices, skin[cKDTree(anatomy.rig.rest_vertices[skin]).query(rest_vertices)[1]])
+        distance, nearest = cKDTree(anatomy.rig.rest_vertices[skin]).query(rest_vertices, k=NEAREST)
+        weights = 1 / np.maximum(distance, 1e-4) ** 2  # metres; where vertices coincide the one is enough
+        return cls(topology, rest_vertices, skin[nearest], weights / weights.sum(axis=1, keepdims=True))
 
     @classmethod
     def of_part(cls, anatomy: Anatomy, faces: Bool[np.ndarray, "F"]) -> "Surface":
@@ -58,7 +64,8 @@ class Surface:
         low, high = uv.min(axis=0), uv.max(axis=0)
         enlarged = 0.01 + 0.98 * (uv - low) / (high - low)  # leaves room for what a lookup at the border reads
         own = Topology(len(body_vertices), own_faces.reshape(-1, 3), enlarged.astype(np.float32), own_uv_faces.reshape(-1, 3))
-        return cls(own, anatomy.rig.rest_vertices[body_vertices], body_vertices)
+        points = anatomy.rig.rest_vertices[body_vertices]
+        return cls(own, points, body_vertices[:, None], np.ones((len(points), 1)))
 
 
 class Canvas:
@@ -75,12 +82,13 @@ class Canvas:
         self.anatomy, self.size = anatomy, size
         self.rng = np.random.default_rng(seed)
         self._atlas = UvAtlas(surface.topology, size)
-        self._body_vertices = surface.body_vertices
+        self._surface = surface
         self.points = self._interpolated(surface.points)
 
     def field(self, values: Float[np.ndarray, "V"]) -> Map:
         """One value of each of the body's vertices at every texel."""
-        return self._interpolated(values[self._body_vertices, None])[..., 0]
+        carried = (values[self._surface.body_vertices] * self._surface.weights).sum(axis=1)
+        return self._interpolated(carried[:, None])[..., 0]
 
     def _interpolated(self, values: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "S S C"]:
         maps = self._atlas.texels_from_vertices(torch.from_numpy(values.astype(np.float32))[None])[0]

@@ -25,7 +25,7 @@ def eyes(anatomy: Anatomy, seed: int, size: int = 256) -> BodyPart:
     faces = np.isin(anatomy.piece, eye_pieces(anatomy))[anatomy.rig.topology.faces].all(axis=1)
     surface = Surface.of_part(anatomy, faces)
     appearance = Appearance.of(paint_eyes(Canvas(anatomy, surface, size, seed)), EYE_SPECULAR)
-    return BodyPart(Layer("eyes", surface.topology, appearance), faces, surface.body_vertices)
+    return BodyPart(Layer("eyes", surface.topology, appearance), faces, surface.body_vertices[:, 0])
 
 
 def teeth(anatomy: Anatomy, body: DressedBody) -> tuple[RigidProp, RigidProp]:
