@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from mitsuba_avatar.filming.settings import StudioSettings
 
 SHARE_OF_PERSON = 0.32  # of an image's pixels: only these are traced
-PATHS_PER_SECOND = 1.7e6  # camera rays times paths that go on from them
+PATHS_PER_SECOND = 4.5e6  # camera rays times paths that go on from them
 SECONDS_PER_IMAGE = 0.012  # whatever its size: preparing and writing it
 SECONDS_PER_PIXEL = 1.5e-7  # encoding
 SECONDS_PER_FRAME = 0.10  # surfaces and their occlusion
-SIMULATION_SECONDS = 0.15  # a frame of simulated cloth at ten frames a second
+SIMULATION_SECONDS = 0.18  # a frame of simulated cloth at ten frames a second, with its share of settling
 BYTES_PER_PIXEL, BYTES_PER_FRAME = 1.1, 430_000  # PNG of image and mask; arrays and truth
 LONG = 48 * 3600.0  # seconds beyond which filming is refused without a shard
 
