@@ -3,7 +3,7 @@
 import pytest
 
 from mitsuba_avatar import progress
-from mitsuba_avatar.progress import progress_bar
+from mitsuba_avatar.progress import StageProgress, progress_bar
 
 
 @pytest.fixture
@@ -65,3 +65,13 @@ def test_nothing_done_yet_is_not_a_division_by_zero(clock, capsys):
         clock.now += 20
         bar.update(0)
     assert "0/10  -  inf s left" in capsys.readouterr().err
+
+
+def test_stages_follow_each_other(capsys: pytest.CaptureFixture[str]):
+    """Each stage ends with a line of its own where there is no terminal."""
+    with StageProgress() as progress:
+        progress.update("simulating", 1, 2)
+        progress.update("simulating", 2, 2)
+        progress.update("filming", 3, 3)
+    lines = [line for line in capsys.readouterr().err.splitlines() if line]
+    assert [line.split("  ")[0] for line in lines] == ["simulating: 2/2", "filming: 3/3"]

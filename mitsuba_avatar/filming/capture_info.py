@@ -1,7 +1,7 @@
 """Figures of a filmed capture: `info.json`, and the table of how much of the surface pose explains.
 
 info.json     hidden_mm (what the better of two predictions from pose leaves over, root mean square), frames, cameras, seconds, and more
-truth/filming_log.csv     a line for every process that filmed: seconds, images
+truth/filming_log.csv     a line for every process that filmed: seconds, frames
 """
 
 import csv
@@ -45,7 +45,7 @@ def write_info(folder: Path, performance: Performance, rest_vertices: Float32[np
     info = {
         "hidden_mm": None if hidden is None else hidden.hidden_mm,
         "hidden_state": None if hidden is None else asdict(hidden),
-        "test_pose_distance_deg": test_pose_distances(performance),
+        "test_pose_distance_deg": distances_of_segments(performance),
         "frames": len(performance),
         "cameras": performance.settings.cameras.train + performance.settings.cameras.held_out,
         "images": len(images),
@@ -58,7 +58,7 @@ def write_info(folder: Path, performance: Performance, rest_vertices: Float32[np
     return info
 
 
-def test_pose_distances(performance: Performance) -> dict[str, float]:
+def distances_of_segments(performance: Performance) -> dict[str, float]:
     """Median distance of each test segment's poses from the nearest training pose, degrees (over the body's angles)."""
     distances = np.degrees(pose_distances(performance.person.rig, performance.motion))
     segments: dict[str, list[float]] = {}
@@ -91,16 +91,12 @@ def measure_gates(performance: Performance, progress: Callable[[str, int, int], 
     """Simulate what is not simulated yet, and measure what a capture of it could show; no image is made.
 
     Returns:
-        how much pose explains, with the chaos floor where a garment is simulated, and the distances of `test_pose_distances`.
+        how much pose explains, with the chaos floor where a garment is simulated, and the distances of `distances_of_segments`.
 
     Raises:
         ValueError: if there are no test frames to score on, or a garment explodes.
     """
-    orders = performance.unsimulated(list(range(len(performance))))
-    total, before = performance.frames_of(orders), 0
-    for order in orders:
-        performance.simulate(order, lambda done, _, before=before: progress("simulating cloth", before + done, total))
-        before += performance.frames_of([order])
+    performance.simulate_missing(list(range(len(performance))), lambda done, total: progress("simulating cloth", done, total))
     floor = None
     if performance.person.outfit is not None:
         floor = chaos_floor(performance, lambda done, total: progress("simulating from another start", done, total))
@@ -111,7 +107,7 @@ def measure_gates(performance: Performance, progress: Callable[[str, int, int], 
     hidden = hidden_state(performance, np.stack(rest), floor)
     if hidden is None:
         raise ValueError("measure_gates(): expected training and test frames; got a script without one of them. Set motion.test_frames.")
-    return hidden, test_pose_distances(performance)
+    return hidden, distances_of_segments(performance)
 
 
 def chaos_floor(performance: Performance, progress: Progress | None = None) -> Error:

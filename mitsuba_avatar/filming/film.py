@@ -113,7 +113,7 @@ class _Filming:
         made = 0
         try:
             write_truth(self.folder, self.performance.person.layers, list(self.dome.cameras), self.settings)
-            self._simulate()
+            self.performance.simulate_missing(list(self.images), lambda done, total: self.progress("simulating cloth", done, total))
             for _ in self._film():
                 made += 1
             if self.settings.cameras.chart_samples_per_pixel and not (self.folder / "chart" / "chart.json").is_file():
@@ -121,15 +121,6 @@ class _Filming:
         finally:
             log_filming(self.folder / TRUTH_FOLDER, time.perf_counter() - started, made)
         return self._finish() if self._is_all_there() else None
-
-    def _simulate(self) -> None:
-        """The garment of every segment that this shard shows."""
-        performance = self.performance
-        orders = performance.unsimulated(list(self.images))
-        total, before = performance.frames_of(orders), 0
-        for order in orders:
-            performance.simulate(order, lambda done, _, before=before: self.progress("simulating cloth", before + done, total))
-            before += performance.frames_of([order])
 
     def _film(self) -> Iterator[int]:
         """Make the images that are missing; yields after each frame."""

@@ -19,6 +19,7 @@ from mitsuba_avatar.body.skinning import pose_vertices, unpose_vertices
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.filming.anatomy import FOOT, LEG
 from mitsuba_avatar.filming.cloth_simulation import BodyMotion, ClothSimulator
+from mitsuba_avatar.filming.garment_layers import register_garment
 from mitsuba_avatar.filming.motion import Motion, perform
 from mitsuba_avatar.filming.person import Person, dress_person
 from mitsuba_avatar.filming.settings import ClothingSettings, StudioSettings
@@ -84,8 +85,8 @@ class Performance:
         else:
             cloth = self.garment(frame)
             body = self._posed(frame, (filmed_rest + person.under.inset).astype(np.float32))
-            registered = self._posed(frame, (person.registered.vertices + moved).astype(np.float32))
-            registered[person.outfit.mesh.body_vertices] = cloth[: len(person.outfit.mesh.body_vertices)]
+            bare = self._posed(frame, (person.registered.vertices + moved).astype(np.float32))
+            registered = register_garment(bare[None], person.outfit.mesh, cloth[None])[0]
             rest = self._unposed(frame, registered)
             garment = [cloth]
         return Surfaces([body, *garment, *(part.surface(body) for part in person.parts)], registered, rest)
@@ -108,6 +109,18 @@ class Performance:
     def frames_of(self, orders: list[int]) -> int:
         """How many frames some segments hold together."""
         return sum(self._segments[order].stop - self._segments[order].start for order in orders)
+
+    def simulate_missing(self, frames: list[int], progress: Progress) -> None:
+        """Simulate every segment that holds some of these frames and is not simulated yet; `progress` counts frames of all of them.
+
+        Raises:
+            ValueError: as `surfaces`; segments before the one that explodes are kept.
+        """
+        orders = self.unsimulated(frames)
+        total, before = self.frames_of(orders), 0
+        for order in orders:
+            self.simulate(order, lambda done, _, before=before: progress(before + done, total))
+            before += self.frames_of([order])
 
     def simulate(self, order: int, progress: Progress | None = None) -> None:
         """Simulate the garment of a segment and keep it, whole or not at all.

@@ -35,13 +35,15 @@ class FilmingPlan:
         return self.frames * self.cameras
 
     def text(self) -> str:
-        """The plan in three lines."""
+        """The plan in words: what, how long and how large, and for a long one how to share it out."""
         hours = self.seconds / 3600
         duration = f"{self.seconds / 60:.1f} minutes" if hours < 1 else f"{hours:.1f} hours" if hours < 48 else f"{hours / 24:,.0f} days"
+        shards = self.suggested_shards()
+        advice = f"a shard i/n films n-th parts of the images: --shard 0/{shards} takes about an hour\n" if shards > 1 else ""
         return (
             f"{self.frames:,} frames from {self.cameras} cameras of {self.width} x {self.height} pixels: {self.images:,} images\n"
             f"about {duration} on two cores, {self.bytes / 1e9:,.2f} GB\n"
-            f"a shard i/n films n-th parts of the images: --shard 0/{self.suggested_shards()} takes about an hour\n"
+            f"{advice}"
         )
 
     def suggested_shards(self) -> int:
