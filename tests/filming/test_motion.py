@@ -9,7 +9,7 @@ from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.filming.motion import Motion, body_angles, perform, pose_distances
 from mitsuba_avatar.filming.settings import MotionSettings, StudioSettings
 from tests.filming.acted import Acted
-from tests.filming.recordings import bvh_text, movement
+from tests.recordings.written import bvh_text, movement
 
 NAMES = ("eyeBlinkLeft", "eyeBlinkRight", "jawOpen", "mouthSmileLeft")
 

@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsuba_avatar.filming.bvh import joint_transforms, read_bvh
-from tests.filming.recordings import NAMES, Z_UP_FACING_X, Encoding, bvh_text, movement, positions
+from mitsuba_avatar.recordings.bvh import joint_transforms, read_bvh
+from tests.recordings.written import NAMES, Z_UP_FACING_X, Encoding, bvh_text, movement, positions
 
 SMALL = """HIERARCHY
 ROOT Big Hips

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mitsuba_avatar.body.rig import Rig
-from mitsuba_avatar.filming.angle_solver import AngleSolver, BoneTargets, PositionTargets
+from mitsuba_avatar.recordings.angle_solver import AngleSolver, BoneTargets, PositionTargets
 
 BONES = ("spine01", "upperarm02.L", "wrist.L", "foot.R")
 

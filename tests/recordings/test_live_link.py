@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsuba_avatar.filming.live_link import read_live_link
+from mitsuba_avatar.recordings.live_link import read_live_link
 
 NAMES = ("jawOpen", "eyeBlinkLeft", "eyeLookOutRight")
 HEADER = "Timecode,BlendshapeCount,EyeBlinkLeft,EyeLookOutRight,JawOpen,HeadYaw"

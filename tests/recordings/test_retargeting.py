@@ -6,10 +6,10 @@ import torch
 
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skeleton import Skeleton
-from mitsuba_avatar.filming.bvh import BvhRecording, read_bvh
-from mitsuba_avatar.filming.humanoid import Humanoid
-from mitsuba_avatar.filming.retargeting import Retargeted, retarget
-from tests.filming.recordings import NAMES, Z_UP_FACING_X, Encoding, bvh_text, movement, positions
+from mitsuba_avatar.recordings.bvh import BvhRecording, read_bvh
+from mitsuba_avatar.recordings.humanoid import Humanoid
+from mitsuba_avatar.recordings.retargeting import Retargeted, retarget
+from tests.recordings.written import NAMES, Z_UP_FACING_X, Encoding, bvh_text, movement, positions
 
 TIMES = np.arange(11) / 10
 BONES = {

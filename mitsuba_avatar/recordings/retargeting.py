@@ -15,9 +15,9 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from mitsuba_avatar.body.rig import Rig
-from mitsuba_avatar.filming.angle_solver import AngleSolver, BoneTargets, PositionTargets
-from mitsuba_avatar.filming.bvh import joint_transforms
-from mitsuba_avatar.filming.humanoid import Humanoid
+from mitsuba_avatar.recordings.angle_solver import AngleSolver, BoneTargets, PositionTargets
+from mitsuba_avatar.recordings.bvh import joint_transforms
+from mitsuba_avatar.recordings.humanoid import Humanoid
 
 ARM_CLEARANCE = np.radians(20.0)  # between a hanging upper arm and the trunk, so that clothes have room
 STANDING_SPEED = 0.35  # metres per second below which a foot near the floor stands

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from mitsuba_avatar.filming.bvh import BvhRecording, joint_transforms
+from mitsuba_avatar.recordings.bvh import BvhRecording, joint_transforms
 
 _SIDED = {
     "clavicle": ("shoulder", "collar", "clavicle"),

@@ -1,0 +1,1 @@
+"""What drives a finished avatar: signals from other sources, imputed latent codes, reconstruction from images."""

@@ -1,0 +1,1 @@
+"""A driven avatar in other programs: glTF, mesh sequences, textures."""

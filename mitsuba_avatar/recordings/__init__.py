@@ -1,0 +1,1 @@
+"""Motion and faces that other systems recorded: BVH retargeted onto the rig, Live Link Face."""
