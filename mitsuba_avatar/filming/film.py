@@ -112,7 +112,9 @@ class _Filming:
         started = time.perf_counter()
         made = 0
         try:
-            write_truth(self.folder, self.performance.person.layers, list(self.dome.cameras), self.settings)
+            person = self.performance.person
+            garment = None if person.outfit is None else person.outfit.mesh.body_vertices
+            write_truth(self.folder, person.layers, garment, list(self.dome.cameras), self.settings)
             self.performance.simulate_missing(list(self.images), lambda done, total: self.progress("simulating cloth", done, total))
             for _ in self._film():
                 made += 1

@@ -18,14 +18,14 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.captures.frames import Frame
 from mitsuba_avatar.filming import choreography
-from mitsuba_avatar.recordings.bvh import read_bvh
 from mitsuba_avatar.filming.choreography import waves
 from mitsuba_avatar.filming.face import conversation_face, expression_tour, gaze_of_actions, resting_face
+from mitsuba_avatar.filming.settings import StudioSettings
+from mitsuba_avatar.filming.takes import DEFAULT, STUDY, PlannedTake, Take, frames_of, plan_recordings, plan_takes
+from mitsuba_avatar.recordings.bvh import read_bvh
 from mitsuba_avatar.recordings.humanoid import Humanoid
 from mitsuba_avatar.recordings.live_link import read_live_link
 from mitsuba_avatar.recordings.retargeting import retarget
-from mitsuba_avatar.filming.settings import StudioSettings
-from mitsuba_avatar.filming.takes import DEFAULT, STUDY, PlannedTake, Take, frames_of, plan_recordings, plan_takes
 
 FOOT_LIFT = 0.05  # metres that a foot must leave the floor before it clearly no longer carries the person
 DISTANCE = np.radians(45.0)  # of the study's test poses from the nearest training pose, in the middle of a take; see `pose_distances`

@@ -1,6 +1,7 @@
 """What made the images, kept beside a capture for scoring and out of reach of training: the folder `truth/`.
 
 truth/<layer>/albedo.exr, roughness.exr     linear reflectance and roughness in the layer's atlas
+truth/garment_body_vertices.npy             which vertices of the registered mesh are the simulated garment's
 truth/light/<scene>.xml and its files       the light, as a Mitsuba scene that opens where it lies
 truth/sensors.json                          each camera's response to colour, noise
 truth/ambient_occlusion/<frame>.png         of the true surface, 8 bits, white where open
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 
 from mitsuba_avatar.body.rig import Topology
 from mitsuba_avatar.captures.images import write_mask
@@ -25,20 +26,31 @@ from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
 from mitsuba_avatar.resources import find_resource
 
 TRUTH_FOLDER = "truth"
+GARMENT = "garment_body_vertices.npy"
 
 
-def write_truth(folder: Path | str, layers: Sequence[Layer], camera_names: Sequence[str], settings: StudioSettings) -> None:
+def write_truth(
+    folder: Path | str,
+    layers: Sequence[Layer],
+    garment: Int[np.ndarray, "G"] | None,
+    camera_names: Sequence[str],
+    settings: StudioSettings,
+) -> None:
     """Write all truth that does not change from frame to frame.
 
     Args:
         folder: the capture's; `truth/` is made in it.
         layers: what is filmed.
+        garment: vertices of the registered mesh that are the simulated garment's; None where nothing is simulated.
         camera_names: training cameras first, as the sensors are.
         settings: what the capture is filmed with.
     """
     truth = Path(folder) / TRUTH_FOLDER
     for layer in layers:
         layer.appearance.save(truth / layer.name)
+    if garment is not None:
+        with atomic_path(truth / GARMENT) as temporary:
+            np.save(temporary, garment)
     copy_scene(find_resource("scenes", settings.light.scene, ".xml"), truth / "light")
     sensor = Sensor.of(settings)
     document = {

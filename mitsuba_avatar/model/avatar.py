@@ -228,16 +228,35 @@ class Avatar(nn.Module):
         Raises:
             ValueError: as `decode`; also if an avatar with a latent code gets no registered mesh.
         """
+        z, posterior = self._draw_latent(registered_vertices, theta, root, noise)
+        return self.decode(theta, root, face, z, camera_centers, ambient_occlusion), posterior
+
+    def reconstruct_surface(
+        self,
+        registered_vertices: Float[Tensor, "P V 3"] | None,
+        theta: Float[Tensor, "P D"],
+        root: Float[Tensor, "P 4 4"],
+        face: Float[Tensor, "P F"],
+        noise: Float[Tensor, "P Z"] | None,
+    ) -> tuple[Float[Tensor, "P V 3"], Posterior | None]:
+        """The posed surface and the posterior of `forward` alone, without cameras, occlusion or texture; arguments and errors as there."""
+        z, posterior = self._draw_latent(registered_vertices, theta, root, noise)
+        rest_vertices = self.decode_rest_vertices(theta, face, z)
+        return pose_vertices(rest_vertices, self.skeleton(theta, root), self.skinning_weights), posterior
+
+    def _draw_latent(
+        self, registered_vertices: Tensor | None, theta: Tensor, root: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor | None, Posterior | None]:
+        """Latent code of a training pass, and the posterior that it is from; nothing for an avatar without."""
         if not self.settings.use_latent:
-            return self.decode(theta, root, face, None, camera_centers, ambient_occlusion), None
+            return None, None
         if registered_vertices is None:
             raise ValueError(
                 "Avatar(): expected registered vertices to encode; got None. Train on a capture with vertices.npy, "
                 "or set model.use_latent false."
             )
         posterior = self.encode(self.unpose(registered_vertices, theta, root))
-        z = posterior.mu if noise is None else posterior.sample(noise)
-        return self.decode(theta, root, face, z, camera_centers, ambient_occlusion), posterior
+        return posterior.mu if noise is None else posterior.sample(noise), posterior
 
     def _displaced(self, displacement: Float[Tensor, "P 3 G G"]) -> Float[Tensor, "P V 3"]:
         """Template plus decoded displacement, rest space."""

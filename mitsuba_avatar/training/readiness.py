@@ -40,6 +40,17 @@ def check_trainable(capture: Capture, settings: Settings, process: Process) -> N
             f"check_trainable(): expected registered meshes for the encoder in {capture.path / 'vertices.npy'}; got none. "
             "Add the file, or set model.use_latent false."
         )
+    if settings.loss.image == 0 and settings.loss.mask == 0:
+        if capture.vertices is None:
+            raise FileNotFoundError(
+                f"check_trainable(): expected registered meshes in {capture.path / 'vertices.npy'}, because loss.image and loss.mask "
+                "are 0; got none. Add the file, or raise one of the two."
+            )
+        if process.is_distributed:
+            raise ValueError(
+                "check_trainable(): expected one process, because loss.image and loss.mask are 0; "
+                f"got {process.num_ranks}. Start fit without torchrun."
+            )
     if len(capture.frame_indices("train")) < 2:
         raise ValueError(
             f"check_trainable(): expected at least two training frames in {capture.path / 'frames.csv'}; got one. "

@@ -12,7 +12,7 @@ from mitsuba_avatar.filming.grids import grid_topology
 from mitsuba_avatar.filming.sensor import Sensor
 from mitsuba_avatar.filming.settings import CameraSettings, LightSettings, StudioSettings
 from mitsuba_avatar.filming.stage import Layer
-from mitsuba_avatar.filming.truth import OcclusionTruth, copy_scene, write_truth
+from mitsuba_avatar.filming.truth import GARMENT, OcclusionTruth, copy_scene, write_truth
 from tests.filming.posed_body import PosedBody, posed_body
 
 
@@ -25,7 +25,8 @@ def test_paint_sensors_and_light_are_kept(tmp_path: Path):
     settings = StudioSettings(cameras=CameraSettings(train=2, held_out=1, colour_spread=0.1), light=LightSettings(scene="half_lit"))
     rng = np.random.default_rng(0)
     paint = Appearance(rng.uniform(0.1, 0.7, (8, 8, 3)).astype(np.float32), rng.uniform(0.2, 1, (8, 8)).astype(np.float32))
-    write_truth(tmp_path, [Layer("shirt", grid_topology(2, 2), paint)], ["a", "b", "c"], settings)
+    write_truth(tmp_path, [Layer("shirt", grid_topology(2, 2), paint)], np.array([4, 9]), ["a", "b", "c"], settings)
+    assert np.load(tmp_path / "truth" / GARMENT).tolist() == [4, 9]
     np.testing.assert_array_equal(read_image(tmp_path / "truth" / "shirt" / "albedo.exr"), paint.base_colour)
     np.testing.assert_array_equal(read_image(tmp_path / "truth" / "shirt" / "roughness.exr")[..., 1], paint.roughness)
     kept = json.loads((tmp_path / "truth" / "sensors.json").read_text())

@@ -43,6 +43,15 @@ def test_meshes_are_needed_by_the_encoder_alone(copy):
     check_trainable(Capture.open(copy), resolve("tiny", ["model.use_latent=false"]), Process())
 
 
+def test_meshes_and_one_process_are_needed_where_pictures_teach_nothing(copy):
+    settings = resolve("tiny", ["loss.image=0", "loss.mask=0", "model.use_latent=false"])
+    with pytest.raises(ValueError, match="expected one process, because loss.image and loss.mask are 0; got 2"):
+        check_trainable(Capture.open(copy), settings, Process(1, 2))
+    (copy / "vertices.npy").unlink()
+    with pytest.raises(FileNotFoundError, match="raise one of the two"):
+        check_trainable(Capture.open(copy), settings, Process())
+
+
 def test_one_training_frame_is_too_few(copy):
     text = (copy / "frames.csv").read_text()
     first, rest = text.split("train", 1)

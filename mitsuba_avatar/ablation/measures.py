@@ -1,0 +1,278 @@
+"""What one run of an ablation is measured by: image error driven with z = 0, geometry against the truth, disentanglement.
+
+Image errors are means over pictures of the mean squared difference inside the captured mask, in 0..255 values, as in the paper's table.
+Truth is read where the capture is the studio's own (its folder `truth/`), and left out where it is not.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mitsuba_avatar.body.driving import driving_masks
+from mitsuba_avatar.body.rig import Rig
+from mitsuba_avatar.body.skinning import pose_vertices
+from mitsuba_avatar.body.uv import texel_of_uv
+from mitsuba_avatar.captures.arrays import open_frame_array
+from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.filming.truth import GARMENT, TRUTH_FOLDER
+from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.model.encoder import Posterior
+from mitsuba_avatar.model.keypoints import DrivenKeypoints, lists_face_landmarks
+from mitsuba_avatar.reporting.disentanglement import (
+    Drive,
+    drive_swap,
+    fresh_mutual_information,
+    latent_swap,
+    latent_use,
+    linear_probe,
+    other_frames,
+)
+from mitsuba_avatar.reporting.evaluation import Evaluator, as_images
+from mitsuba_avatar.reporting.metrics import l1_in_mask, mse_in_mask, psnr_from_mse, silhouette_iou
+from mitsuba_avatar.training.statistics import evenly_spaced
+
+MILLIMETRES = 1000.0  # in a metre
+STRESS = "stress"  # segments whose name begins so are reported apart
+AT_ONCE = 8  # frames
+PRINCIPAL = 16  # directions of the hidden state that the probe is asked for
+RIDGE = 10.0  # of the regression on pose that the hidden state is what is left of, in deviations of an angle
+CELLS, REACH = 32, 3  # of the map that localizes the face signal; cells that two convolutions and the doublings after them reach
+FEWEST_FRAMES = 64  # of training that an estimate of mutual information is worth making on
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Splits:
+    """Frames that are measured, by what they are: "train", "validation", "test", "stress"; empty ones are left out."""
+
+    frames: dict[str, list[int]]
+
+    @classmethod
+    def of(cls, capture: Capture, most: int) -> "Splits":
+        """At most `most` evenly spaced frames of each."""
+        groups: dict[str, list[int]] = {"train": [], "validation": [], "test": [], STRESS: []}
+        for index, frame in enumerate(capture.frames):
+            groups[STRESS if frame.segment.startswith(STRESS) else frame.split].append(index)
+        return cls({name: evenly_spaced(frames, most) for name, frames in groups.items() if frames})
+
+
+def image_errors(evaluator: Evaluator, splits: Splits, progress: Progress = lambda done, total: None) -> dict[str, dict[str, float]]:
+    """Split -> errors of the avatar driven with z = 0, over all cameras and over held-out cameras alone.
+
+    Returns:
+        for each split `mse`, `l1` (0..255), `psnr` (of the mean error, dB), `iou`, `held_out_mse`, and `pictures`, how many were counted.
+    """
+    capture = evaluator.capture
+    names, held_out = capture.camera_names(), set(capture.camera_names(held_out=True))
+    total, done = sum(map(len, splits.frames.values())), 0
+    errors = {}
+    for split, frames in splits.frames.items():
+        rows = []
+        for frame in frames:
+            batch = evaluator.reader.read([frame], [names])
+            drawn = evaluator.draw("avatar", batch)
+            pictures = zip(names, as_images(drawn.images), as_images(batch.images), drawn.masks, batch.masks, strict=True)
+            for name, image, captured, mask, captured_mask in pictures:
+                inside = captured_mask[0].numpy()
+                if inside.any():
+                    iou = silhouette_iou(mask[0].numpy(), inside)
+                    rows.append((mse_in_mask(image, captured, inside), l1_in_mask(image, captured, inside), iou, name in held_out))
+            done += 1
+            progress(done, total)
+        mse, l1, iou, is_held_out = np.array(rows, dtype=np.float64).T
+        errors[split] = {
+            "mse": float(mse.mean()),
+            "l1": float(l1.mean()),
+            "psnr": psnr_from_mse(float(mse.mean())),
+            "iou": float(iou.mean()),
+            "pictures": len(rows),
+        }
+        if is_held_out.any():
+            errors[split]["held_out_mse"] = float(mse[is_held_out > 0].mean())
+    return errors
+
+
+@dataclass(frozen=True)
+class Study:
+    """A trained avatar and the frames of the capture that judge it, encoded.
+
+    Attributes:
+        avatar, rig, capture: of the run.
+        drive: of all N frames.
+        posterior: of all frames; None for an avatar without a latent code.
+        exact: [N, V, 3] true registered surface, world, metres; the capture's own mesh where there is no truth.
+        garment: vertices that are clothes; None where nothing says which.
+    """
+
+    avatar: Avatar
+    rig: Rig
+    capture: Capture
+    drive: Drive
+    posterior: Posterior | None
+    exact: np.ndarray
+    garment: Int[np.ndarray, "G"] | None
+
+    @classmethod
+    def of(cls, avatar: Avatar, rig: Rig, capture: Capture) -> "Study":
+        """Encode every frame of a capture with a registered mesh."""
+        truth, count = capture.path / TRUTH_FOLDER, len(capture.frames)
+        theta, root, face = (torch.from_numpy(np.array(values, np.float32)) for values in (capture.theta, capture.root, capture.face))
+        exact = open_frame_array(truth, "vertices", count) if truth.is_dir() else None
+        garment = np.load(truth / GARMENT) if (truth / GARMENT).is_file() else None
+        drive = Drive(theta, root, face)
+        return cls(avatar, rig, capture, drive, _encoded(avatar, capture, drive), capture.vertices if exact is None else exact, garment)
+
+    def frames(self, *splits: str) -> list[int]:
+        """Frames of some splits, in order of time, without stress segments."""
+        return [i for i, frame in enumerate(self.capture.frames) if frame.split in splits and not frame.segment.startswith(STRESS)]
+
+    def groups(self) -> dict[str, np.ndarray]:
+        """Masks over vertices to report distances for, apart from all."""
+        if self.garment is None:
+            return {}
+        mask = np.zeros(self.rig.topology.num_vertices, dtype=bool)
+        mask[self.garment] = True
+        return {"garment": mask}
+
+    def keypoints(self) -> DrivenKeypoints:
+        """What the driving signal fixes."""
+        with_face = lists_face_landmarks(self.rig, self.capture.description.face_signal, self.drive.face.shape[1])
+        return DrivenKeypoints(self.rig, self.avatar.template_vertices, with_face)
+
+
+@torch.no_grad()
+def geometry_errors(study: Study, most: int) -> dict[str, dict[str, float]]:
+    """Split -> mean distances in millimetres from the true surface: of the registered mesh that the avatar was trained on, of the surface
+    driven with z = 0, and of the surface decoded from the frame's own latent code; each over all vertices and over the garment's alone.
+
+    With tracking noise on the registered mesh, "decoded" below "registered" on training frames is what inverse rendering gained.
+    """
+    avatar, capture = study.avatar, study.capture
+    masks = {"": np.ones(study.rig.topology.num_vertices, dtype=bool)} | {f"_{name}": mask for name, mask in study.groups().items()}
+    errors: dict[str, dict[str, float]] = {}
+    for split, frames in Splits.of(capture, most).frames.items():
+        sums: dict[str, list[float]] = {}
+        for frame in frames:
+            row = slice(frame, frame + 1)
+            part = study.drive.rows(row)
+            surfaces = {"registered": np.asarray(capture.vertices[frame]), "driven": _posed(avatar, part, None)}
+            if study.posterior is not None:
+                surfaces["decoded"] = _posed(avatar, part, study.posterior.mu[row])
+            for name, surface in surfaces.items():
+                distance = MILLIMETRES * np.linalg.norm(surface.astype(np.float64) - study.exact[frame], axis=-1)
+                for suffix, mask in masks.items():
+                    sums.setdefault(f"{name}{suffix}_mm", []).append(float(distance[mask].mean()))
+        errors[split] = {name: float(np.mean(values)) for name, values in sums.items()}
+    return errors
+
+
+def disentanglement(study: Study, seed: int = 0) -> dict:
+    """How far latent code and driving signal are apart; an avatar without a latent code has nothing to tell but `spurious`.
+
+    Returns:
+        `spurious` (see `spurious_effects`); `kl_nats`, `active_entries` over training frames; `mutual_information_nats` by a fresh
+        estimator; `latent_swap` and `drive_swap` on test frames; `hidden_state_r2`, what a linear probe reads off z of the garment's
+        state that pose does not tell, on test frames (where the truth is known).
+    """
+    result: dict = {"spurious": spurious_effects(study, seed)}
+    if study.posterior is None:
+        return result
+    train, judged = study.frames("train"), study.frames("test") or study.frames("train")
+    posterior = Posterior(study.posterior.mu[train], study.posterior.logvar[train])
+    driving = study.avatar.standardized_driving(study.drive.theta, study.drive.face)
+    use = latent_use(posterior)
+    result |= {"kl_nats": use.kl_nats, "active_entries": use.active_entries}
+    if len(train) >= FEWEST_FRAMES:
+        result["mutual_information_nats"] = fresh_mutual_information(posterior, driving[train], seed=seed)
+    rows = torch.tensor(judged)
+    drive, z = study.drive.rows(rows), study.posterior.mu[rows]
+    others = other_frames(driving[rows], seed)
+    keypoints, groups = study.keypoints(), study.groups()
+    result["latent_swap"] = asdict(latent_swap(study.avatar, keypoints, drive, z, z[others], groups))
+    result["drive_swap"] = asdict(drive_swap(study.avatar, keypoints, drive.rows(others), z, groups))
+    if study.garment is not None and judged != train:
+        hidden = _hidden_state(study, train)
+        mu = study.posterior.mu.double().numpy()
+        result["hidden_state_r2"] = linear_probe(mu[train], hidden[train], mu[judged], hidden[judged])
+    return result
+
+
+@torch.no_grad()
+def spurious_effects(study: Study, seed: int = 0) -> dict[str, float]:
+    """Chance correlations, seen directly: the face of one frame with the pose of another, z = 0, on training frames.
+
+    Returns:
+        mean distances in millimetres: `face_moves_body_mm`, how far another face moves the surface outside the region of the face signal,
+        and `pose_moves_face_mm`, how far another pose moves the face's landmarks in the head's frame (0 where the face signal lists none).
+    """
+    frames = torch.tensor(evenly_spaced(study.frames("train"), 64))
+    drive = study.drive.rows(frames)
+    others = other_frames(study.avatar.standardized_driving(drive.theta, drive.face), seed)
+    outside = ~face_region(study.rig)
+    landmarks = torch.from_numpy(study.rig.face_keypoint_vertices)
+    body, face = [], []
+    for start in range(0, len(frames), AT_ONCE):
+        rows = slice(start, start + AT_ONCE)
+        theta, expression = drive.theta[rows], drive.face[rows]
+        rest, other_face, other_pose = (
+            study.avatar.decode_rest_vertices(angles, signal, None)
+            for angles, signal in ((theta, expression), (theta, drive.face[others][rows]), (drive.theta[others][rows], expression))
+        )
+        body.append((other_face - rest).norm(dim=-1)[:, torch.from_numpy(outside)])
+        face.append((other_pose - rest).norm(dim=-1)[:, landmarks])
+    return {
+        "face_moves_body_mm": MILLIMETRES * float(torch.cat(body).mean()),
+        "pose_moves_face_mm": MILLIMETRES * float(torch.cat(face).mean()) if len(landmarks) else 0.0,
+    }
+
+
+def face_region(rig: Rig) -> Bool[np.ndarray, "V"]:
+    """Vertices that the face signal may reach under localization: they lie in a cell of its mask, or within the decoder's reach of one."""
+    cells = driving_masks(rig, CELLS).face[None, None]
+    near = torch.nn.functional.max_pool2d(cells, kernel_size=2 * REACH + 1, stride=1, padding=REACH)[0, 0].numpy() > 0
+    row, column = np.floor(texel_of_uv(rig.topology.uv, CELLS, CELLS) + 0.5).astype(int).clip(0, CELLS - 1).T
+    inside = np.zeros(rig.topology.num_vertices, dtype=bool)
+    np.logical_or.at(inside, rig.topology.faces.ravel(), near[row, column][rig.topology.uv_faces.ravel()])
+    return inside
+
+
+def _hidden_state(study: Study, train: list[int]) -> Float[np.ndarray, "N K"]:
+    """The garment's true shape in rest space, less what ridge regression on the pose angles tells of it: main directions, metres."""
+    avatar, count = study.avatar, len(study.capture.frames)
+    garment = []
+    for start in range(0, count, AT_ONCE):
+        part = study.drive.rows(slice(start, start + AT_ONCE))
+        exact = torch.from_numpy(np.array(study.exact[start : start + AT_ONCE], np.float32))
+        garment.append(avatar.unpose(exact, part.theta, part.root)[:, torch.from_numpy(study.garment)].flatten(1).numpy())
+    shape = np.concatenate(garment).astype(np.float64)
+    angles = study.drive.theta.double().numpy()
+    moving = angles[train].std(0) > 1e-4
+    angles = (angles - angles[train].mean(0))[:, moving] / angles[train].std(0)[moving]
+    shape -= shape[train].mean(0)
+    gram = angles[train].T @ angles[train] + RIDGE * np.eye(angles.shape[1])
+    residual = shape - angles @ np.linalg.solve(gram, angles[train].T @ shape[train])
+    _, _, directions = np.linalg.svd(residual[train], full_matrices=False)
+    return residual @ directions[:PRINCIPAL].T
+
+
+@torch.no_grad()
+def _encoded(avatar: Avatar, capture: Capture, drive: Drive) -> Posterior | None:
+    """Posterior of every frame of a capture."""
+    if not avatar.settings.use_latent or capture.vertices is None:
+        return None
+    parts = []
+    for start in range(0, len(capture.frames), AT_ONCE):
+        rows = slice(start, start + AT_ONCE)
+        registered = torch.from_numpy(np.array(capture.vertices[rows], np.float32))
+        parts.append(avatar.encode(avatar.unpose(registered, drive.theta[rows], drive.root[rows])))
+    return Posterior(torch.cat([part.mu for part in parts]), torch.cat([part.logvar for part in parts]))
+
+
+def _posed(avatar: Avatar, drive: Drive, z: Tensor | None) -> Float[np.ndarray, "V 3"]:
+    """Decoded surface of one frame in the world, metres."""
+    rest = avatar.decode_rest_vertices(drive.theta, drive.face, z)
+    return pose_vertices(rest, avatar.skeleton(drive.theta, drive.root), avatar.skinning_weights)[0].numpy()

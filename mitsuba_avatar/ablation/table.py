@@ -1,0 +1,135 @@
+"""The ablation table from the figures of measured runs: Markdown, LaTeX (booktabs, best in bold), JSON; the paper's own beside it.
+
+Errors are means over seeds with the deviation between seeds; a gap below that deviation means nothing.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mitsuba_avatar.ablation.plan import PlannedRun
+from mitsuba_avatar.ablation.rows import Row
+from mitsuba_avatar.files import atomic_path
+
+HEADINGS = ("model", "train", "validation", "test", "gap", "KL (nats)", "active", "MI (nats)", "paper train", "paper test")
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean over seeds, and the standard deviation between them; None where there is one seed."""
+
+    mean: float
+    deviation: float | None
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Spread":
+        """Of one number a seed."""
+        return cls(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None)
+
+    def text(self, between: str = " ± ", decimals: int = 2) -> str:
+        """As people write it."""
+        return f"{self.mean:.{decimals}f}" + ("" if self.deviation is None else f"{between}{self.deviation:.{decimals}f}")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row of the table; errors by split, None where the capture has no such frames or the avatar no latent code."""
+
+    row: Row
+    seeds: int
+    errors: dict[str, Spread]
+    kl_nats: Spread | None
+    active_entries: Spread | None
+    mutual_information: Spread | None
+
+    @property
+    def gap(self) -> float | None:
+        """Test less train error."""
+        return self.errors["test"].mean - self.errors["train"].mean if "test" in self.errors else None
+
+
+def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
+    """One entry for each row, over the seeds that are measured; rows without any are left out."""
+    entries = []
+    for row in dict.fromkeys(run.row for run in runs):
+        measured = [run.measures() for run in runs if run.row == row and run.is_measured]
+        if not measured:
+            continue
+        errors = [driven_errors(one) for one in measured]
+        parts = [one.get("disentanglement", {}) for one in measured]
+        entries.append(
+            Entry(
+                row,
+                len(measured),
+                {split: Spread.of([one[split] for one in errors]) for split in errors[0]},
+                *(_spread(parts, name) for name in ("kl_nats", "active_entries", "mutual_information_nats")),
+            )
+        )
+    return entries
+
+
+def driven_errors(measures: dict) -> dict[str, float]:
+    """Split -> the error that the table is about, driven with z = 0: of pictures, mean squared difference inside the mask in 0..255
+    values; where a rehearsal has none, distance from the true surface in millimetres, of the clothes if they are known."""
+    if "images" in measures:
+        return {split: values["mse"] for split, values in measures["images"].items()}
+    return {split: values.get("driven_garment_mm", values["driven_mm"]) for split, values in measures["geometry"].items()}
+
+
+def markdown(entries: Sequence[Entry]) -> str:
+    """The table as Markdown; the lowest train and test errors are bold."""
+    lines = ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
+    lines += ["| " + " | ".join(_cells(entry, entries, "**{}**", " ± ")) + " |" for entry in entries]
+    return "\n".join(lines) + "\n"
+
+
+def latex(entries: Sequence[Entry]) -> str:
+    """The table as a LaTeX tabular for the package booktabs."""
+    lines = [r"\begin{tabular}{l" + "r" * (len(HEADINGS) - 1) + "}", r"\toprule", " & ".join(HEADINGS) + r" \\", r"\midrule"]
+    lines += [" & ".join(_cells(entry, entries, r"\textbf{{{}}}", r" $\pm$ ")) + r" \\" for entry in entries]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def write_tables(folder: Path, runs: Sequence[PlannedRun]) -> list[Entry]:
+    """Write table.md, table.tex and table.json of all measured runs into a folder; returns the entries.
+
+    The JSON lists every run: `name, seed, train, test` (see `driven_errors`) and all else that was measured.
+    """
+    entries = summarize(runs)
+    rows = []
+    for run in runs:
+        if run.is_measured:
+            measures = run.measures()
+            rows.append({"name": run.row.name, "seed": measures["seed"], **driven_errors(measures), "measures": measures})
+    texts = {"table.md": markdown(entries), "table.tex": latex(entries), "table.json": json.dumps(rows, indent=1) + "\n"}
+    for name, text in texts.items():
+        with atomic_path(folder / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    return entries
+
+
+def _cells(entry: Entry, entries: Sequence[Entry], bold: str, between: str) -> list[str]:
+    """A row's cells, without the rules between them."""
+
+    def error(split: str) -> str:
+        if split not in entry.errors:
+            return "-"
+        best = min(other.errors[split].mean for other in entries if split in other.errors)
+        text = entry.errors[split].text(between)
+        return bold.format(text) if split != "validation" and entry.errors[split].mean == best else text
+
+    def optional(value: Spread | None, decimals: int) -> str:
+        return "-" if value is None else value.text(between, decimals)
+
+    gap = "-" if entry.gap is None else f"{entry.gap:.2f}"
+    published = ["-", "-"] if entry.row.published is None else [f"{value:.3f}" for value in entry.row.published]
+    latent = [optional(entry.kl_nats, 1), optional(entry.active_entries, 0), optional(entry.mutual_information, 2)]
+    return [entry.row.title, error("train"), error("validation"), error("test"), gap, *latent, *published]
+
+
+def _spread(parts: Sequence[dict], name: str) -> Spread | None:
+    """Of a figure that every seed has."""
+    return Spread.of([float(part[name]) for part in parts]) if all(name in part for part in parts) else None

@@ -1,0 +1,58 @@
+"""The table: means and deviations over seeds, the best in bold, runs in JSON."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mitsuba_avatar.ablation.plan import PlannedRun
+from mitsuba_avatar.ablation.rows import choose_rows
+from mitsuba_avatar.ablation.table import driven_errors, latex, markdown, summarize, write_tables
+from mitsuba_avatar.presets import resolve
+
+ERRORS = {("ours", 0): (12.0, 15.0), ("ours", 1): (12.5, 16.0), ("pose_face", 0): (7.0, 17.0), ("pose_face", 1): (9.0, 18.0)}
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> list[PlannedRun]:
+    planned = []
+    for (name, seed), (train, test) in ERRORS.items():
+        run = PlannedRun(choose_rows(name)[0], resolve(f"ablation/{name}", [f"training.seed={seed}"]), tmp_path / name / str(seed))
+        run.path.mkdir(parents=True)
+        latent = {"kl_nats": 5.0 + seed, "active_entries": 40 + seed, "mutual_information_nats": 0.25} if name == "ours" else {}
+        images = {"train": {"mse": train}, "test": {"mse": test}}
+        run.save_measures({"name": name, "seed": seed, "images": images, "disentanglement": latent})
+        planned.append(run)
+    return planned
+
+
+def test_markdown_has_means_deviations_and_the_best_in_bold(runs: list[PlannedRun]):
+    lines = markdown(summarize(runs)).splitlines()
+    assert lines[2] == "| ours | 12.25 ± 0.35 | - | **15.50 ± 0.71** | 3.25 | 5.5 ± 0.7 | 40 ± 1 | 0.25 ± 0.00 | 11.578 | 15.546 |"
+    assert lines[3] == "| pose+face | **8.00 ± 1.41** | - | 17.50 ± 0.71 | 9.50 | - | - | - | 7.647 | 17.509 |"
+
+
+def test_one_seed_has_no_deviation(runs: list[PlannedRun]):
+    assert "| ours | 12.00 | - | **15.00** | 3.00 |" in markdown(summarize([runs[0], runs[2]]))
+
+
+def test_latex_is_a_booktabs_tabular_of_as_many_columns(runs: list[PlannedRun]):
+    text = latex(summarize(runs))
+    rows = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert text.startswith(r"\begin{tabular}{lrrrrrrrrr}") and {row.count("&") for row in rows} == {9}
+    assert r"\textbf{15.50 $\pm$ 0.71}" in text and text.count(r"\textbf") == 2
+    assert [rule for rule in (r"\toprule", r"\midrule", r"\bottomrule") if rule in text] == [r"\toprule", r"\midrule", r"\bottomrule"]
+
+
+def test_files_list_every_run_and_runs_to_come_are_left_out(runs: list[PlannedRun], tmp_path: Path):
+    to_come = PlannedRun(choose_rows("without_shadow")[0], resolve("ablation/without_shadow"), tmp_path / "without_shadow" / "0")
+    write_tables(tmp_path, [*runs, to_come])
+    rows = json.loads((tmp_path / "table.json").read_text())
+    assert [(row["name"], row["seed"], row["train"], row["test"]) for row in rows] == [(*key, *error) for key, error in ERRORS.items()]
+    assert "shadow" not in (tmp_path / "table.md").read_text() and (tmp_path / "table.tex").is_file()
+
+
+def test_a_rehearsal_is_judged_by_distance_from_the_truth():
+    geometry = {"train": {"driven_mm": 3.0, "driven_garment_mm": 9.0}, "test": {"driven_mm": 4.0}}
+    assert driven_errors({"geometry": geometry}) == {"train": 9.0, "test": 4.0}
+    assert driven_errors({"geometry": geometry, "images": {"train": {"mse": 12.0}}}) == {"train": 12.0}

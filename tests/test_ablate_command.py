@@ -1,0 +1,86 @@
+"""The ablation command from end to end, on a small capture with a small avatar."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mitsuba_avatar.ablate import main
+from mitsuba_avatar.presets import resolve
+
+SMALL = [
+    f"model.{key}={','.join(map(str, value)) if isinstance(value, list | tuple) else value}"
+    for key, value in vars(resolve("tiny").model).items()
+    if not key.startswith("use_")
+]
+SHORT = [
+    "training.iterations=4",
+    "training.checkpoint_every=2",
+    "training.validate_every=4",
+    "training.preview_every=4",
+    "training.views_per_pose=2",
+    "evaluation.frames_per_split=2",
+    "evaluation.samples_per_pixel=4",
+    "rendering.ambient_occlusion_rays=16",
+]
+
+
+def test_rows_are_trained_measured_and_tabled_once(drawn_capture, tmp_path: Path, private_cache, capsys: pytest.CaptureFixture):
+    words = [
+        "--capture",
+        str(drawn_capture.path),
+        "--out",
+        str(tmp_path / "out"),
+        "--rows",
+        "pose_face,ours",
+        "--jobs",
+        "2",
+        *SMALL,
+        *SHORT,
+    ]
+    assert main(words) == 0
+    rows = json.loads((tmp_path / "out" / "table.json").read_text())
+    assert [(row["name"], row["seed"]) for row in rows] == [("ours", 0), ("pose_face", 0)]
+    assert all(0 < row["train"] < 5000 and 0 < row["test"] < 5000 for row in rows)
+    assert "kl_nats" in rows[0]["measures"]["disentanglement"] and "kl_nats" not in rows[1]["measures"]["disentanglement"]
+    assert "| pose+face |" in capsys.readouterr().out
+    settings = yaml.safe_load((tmp_path / "out" / "ours" / "seed_0" / "settings.yaml").read_text())
+    assert settings["training"]["iterations"] == 4 and settings["model"]["use_localization"]
+
+    made = (tmp_path / "out" / "ours" / "seed_0" / "measures.json").stat().st_mtime_ns
+    assert main(words) == 0
+    assert (tmp_path / "out" / "ours" / "seed_0" / "measures.json").stat().st_mtime_ns == made
+
+
+def test_a_rehearsal_learns_from_meshes_alone(drawn_capture, tmp_path: Path, private_cache):
+    words = ["--capture", str(drawn_capture.path), "--out", str(tmp_path), "--rows", "pose_face", "--rehearsal", *SMALL, *SHORT]
+    assert main([word for word in words if "views_per_pose" not in word]) == 0
+    row = json.loads((tmp_path / "table.json").read_text())[0]
+    assert "images" not in row["measures"] and row["test"] == row["measures"]["geometry"]["test"]["driven_mm"] > 0
+
+
+def test_a_worker_that_fails_is_told_with_its_log(drawn_capture, tmp_path: Path, private_cache, capsys: pytest.CaptureFixture):
+    words = [
+        "--capture",
+        str(drawn_capture.path),
+        "--out",
+        str(tmp_path / "out"),
+        "--rows",
+        "ours",
+        *SMALL,
+        *SHORT,
+        "training.views_per_pose=9",
+    ]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert "seed_0 ended with status" in told and "views_per_pose" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["--rows", "theirs"], "expected rows among"), (["--jobs", "-1"], "expected --jobs"), (["--budgett", "1"], "Did you mean '--budget'")],
+)
+def test_bad_words_are_refused(words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+    assert main(["--out", str(tmp_path), *words]) == 2
+    assert message in capsys.readouterr().err
