@@ -1,6 +1,10 @@
 """The ablation command from end to end, on a small capture with a small avatar."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -75,6 +79,32 @@ def test_a_worker_that_fails_is_told_with_its_log(drawn_capture, tmp_path: Path,
     assert main(words) == 2
     told = capsys.readouterr().err
     assert "seed_0 ended with status" in told and "views_per_pose" in told
+
+
+def test_workers_save_and_end_when_the_command_is_ended(drawn_capture, tmp_path: Path, private_cache):
+    words = [
+        "--capture",
+        str(drawn_capture.path),
+        "--out",
+        str(tmp_path),
+        "--rows",
+        "pose_face",
+        *SMALL,
+        *SHORT,
+        "training.iterations=4000",
+    ]
+    command = subprocess.Popen([sys.executable, "-m", "mitsuba_avatar.ablate", *words], stderr=subprocess.PIPE, text=True)
+    checkpoints = tmp_path / "pose_face" / "seed_0" / "checkpoints" / "checkpoints.json"
+    while not checkpoints.is_file():
+        assert command.poll() is None
+        time.sleep(0.2)
+    command.send_signal(signal.SIGTERM)
+    assert "interrupted; every run is saved" in command.communicate(timeout=60)[1] and command.returncode == 130
+    stopped_at = json.loads(checkpoints.read_text())["last"]
+    assert 0 < stopped_at < 4000
+    stamp = checkpoints.stat().st_mtime_ns
+    time.sleep(1.5)
+    assert checkpoints.stat().st_mtime_ns == stamp  # nobody goes on unseen
 
 
 @pytest.mark.parametrize(

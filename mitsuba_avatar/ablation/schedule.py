@@ -31,8 +31,9 @@ def run_workers(planned: list[PlannedRun], jobs: int, progress: Callable[[int, i
 
     Raises:
         RuntimeError: a worker failed; the others are interrupted and have saved their checkpoints. The message ends with its log.
-        KeyboardInterrupt: after all workers have saved.
+        KeyboardInterrupt: Ctrl-C or SIGTERM; after all workers have saved.
     """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended from outside, workers must not go on unseen
     waiting = [run for run in planned if not run.is_measured]
     total = sum(run.settings.training.iterations for run in planned)
     workers: dict[subprocess.Popen, PlannedRun] = {}

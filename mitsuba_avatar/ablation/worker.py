@@ -35,7 +35,7 @@ def _limit_threads(threads: int) -> None:
 
 
 def _work(run: PlannedRun) -> int:
-    from mitsuba_avatar.ablation.measures import Splits, Study, disentanglement, geometry_errors, image_errors
+    from mitsuba_avatar.analysis.measures import Splits, Study, disentanglement, geometry_errors, image_errors
     from mitsuba_avatar.fitting import Fit
     from mitsuba_avatar.progress import progress_bar
     from mitsuba_avatar.rendering.surface import SurfaceRenderer

@@ -1,4 +1,4 @@
-"""What one run of an ablation is measured by: image error driven with z = 0, geometry against the truth, disentanglement.
+"""What a run is measured by: image error driven with z = 0, geometry against the truth, disentanglement.
 
 Image errors are means over pictures of the mean squared difference inside the captured mask, in 0..255 values, as in the paper's table.
 Truth is read where the capture is the studio's own (its folder `truth/`), and left out where it is not.
@@ -9,13 +9,13 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from mitsuba_avatar.body.driving import driving_masks
+from mitsuba_avatar.analysis.regions import with_surroundings
+from mitsuba_avatar.body.driving import driving_regions
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skinning import pose_vertices
-from mitsuba_avatar.body.uv import texel_of_uv
 from mitsuba_avatar.captures.arrays import open_frame_array
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.filming.truth import GARMENT, TRUTH_FOLDER
@@ -40,7 +40,6 @@ STRESS = "stress"  # segments whose name begins so are reported apart
 AT_ONCE = 8  # frames
 PRINCIPAL = 16  # directions of the hidden state that the probe is asked for
 RIDGE = 10.0  # of the regression on pose that the hidden state is what is left of, in deviations of an angle
-CELLS, REACH = 32, 3  # of the map that localizes the face signal; cells that two convolutions and the doublings after them reach
 FEWEST_FRAMES = 64  # of training that an estimate of mutual information is worth making on
 Progress = Callable[[int, int], None]
 
@@ -151,23 +150,29 @@ def geometry_errors(study: Study, most: int) -> dict[str, dict[str, float]]:
 
     With tracking noise on the registered mesh, "decoded" below "registered" on training frames is what inverse rendering gained.
     """
-    avatar, capture = study.avatar, study.capture
     masks = {"": np.ones(study.rig.topology.num_vertices, dtype=bool)} | {f"_{name}": mask for name, mask in study.groups().items()}
     errors: dict[str, dict[str, float]] = {}
-    for split, frames in Splits.of(capture, most).frames.items():
+    for split, frames in Splits.of(study.capture, most).frames.items():
         sums: dict[str, list[float]] = {}
         for frame in frames:
-            row = slice(frame, frame + 1)
-            part = study.drive.rows(row)
-            surfaces = {"registered": np.asarray(capture.vertices[frame]), "driven": _posed(avatar, part, None)}
-            if study.posterior is not None:
-                surfaces["decoded"] = _posed(avatar, part, study.posterior.mu[row])
-            for name, surface in surfaces.items():
-                distance = MILLIMETRES * np.linalg.norm(surface.astype(np.float64) - study.exact[frame], axis=-1)
+            part = study.drive.rows(slice(frame, frame + 1))
+            registered, decoded = surface_distances(study, frame)
+            distances = {"registered": registered, "driven": _distance(study, frame, _posed(study.avatar, part, None))}
+            for name, distance in (distances | ({} if study.posterior is None else {"decoded": decoded})).items():
                 for suffix, mask in masks.items():
                     sums.setdefault(f"{name}{suffix}_mm", []).append(float(distance[mask].mean()))
         errors[split] = {name: float(np.mean(values)) for name, values in sums.items()}
     return errors
+
+
+@torch.no_grad()
+def surface_distances(study: Study, frame: int) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:  # noqa: F821
+    """Distance of each vertex from the true surface's, millimetres: of the registered mesh, and of the mesh decoded from the frame's own
+    latent code (z = 0 for an avatar without one)."""
+    row = slice(frame, frame + 1)
+    z = None if study.posterior is None else study.posterior.mu[row]
+    registered = np.asarray(study.capture.vertices[frame])
+    return _distance(study, frame, registered), _distance(study, frame, _posed(study.avatar, study.drive.rows(row), z))
 
 
 def disentanglement(study: Study, seed: int = 0) -> dict:
@@ -206,13 +211,13 @@ def spurious_effects(study: Study, seed: int = 0) -> dict[str, float]:
     """Chance correlations, seen directly: the face of one frame with the pose of another, z = 0, on training frames.
 
     Returns:
-        mean distances in millimetres: `face_moves_body_mm`, how far another face moves the surface outside the region of the face signal,
+        mean distances in millimetres: `face_moves_body_mm`, how far another face moves the surface away from the face,
         and `pose_moves_face_mm`, how far another pose moves the face's landmarks in the head's frame (0 where the face signal lists none).
     """
     frames = torch.tensor(evenly_spaced(study.frames("train"), 64))
     drive = study.drive.rows(frames)
     others = other_frames(study.avatar.standardized_driving(drive.theta, drive.face), seed)
-    outside = ~face_region(study.rig)
+    outside = ~with_surroundings(study.rig, driving_regions(study.rig).face)
     landmarks = torch.from_numpy(study.rig.face_keypoint_vertices)
     body, face = [], []
     for start in range(0, len(frames), AT_ONCE):
@@ -228,16 +233,6 @@ def spurious_effects(study: Study, seed: int = 0) -> dict[str, float]:
         "face_moves_body_mm": MILLIMETRES * float(torch.cat(body).mean()),
         "pose_moves_face_mm": MILLIMETRES * float(torch.cat(face).mean()) if len(landmarks) else 0.0,
     }
-
-
-def face_region(rig: Rig) -> Bool[np.ndarray, "V"]:
-    """Vertices that the face signal may reach under localization: they lie in a cell of its mask, or within the decoder's reach of one."""
-    cells = driving_masks(rig, CELLS).face[None, None]
-    near = torch.nn.functional.max_pool2d(cells, kernel_size=2 * REACH + 1, stride=1, padding=REACH)[0, 0].numpy() > 0
-    row, column = np.floor(texel_of_uv(rig.topology.uv, CELLS, CELLS) + 0.5).astype(int).clip(0, CELLS - 1).T
-    inside = np.zeros(rig.topology.num_vertices, dtype=bool)
-    np.logical_or.at(inside, rig.topology.faces.ravel(), near[row, column][rig.topology.uv_faces.ravel()])
-    return inside
 
 
 def _hidden_state(study: Study, train: list[int]) -> Float[np.ndarray, "N K"]:
@@ -270,6 +265,11 @@ def _encoded(avatar: Avatar, capture: Capture, drive: Drive) -> Posterior | None
         registered = torch.from_numpy(np.array(capture.vertices[rows], np.float32))
         parts.append(avatar.encode(avatar.unpose(registered, drive.theta[rows], drive.root[rows])))
     return Posterior(torch.cat([part.mu for part in parts]), torch.cat([part.logvar for part in parts]))
+
+
+def _distance(study: Study, frame: int, surface: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:  # noqa: F821
+    """Of each vertex from where it truly is, millimetres."""
+    return MILLIMETRES * np.linalg.norm(surface.astype(np.float64) - study.exact[frame], axis=-1)
 
 
 def _posed(avatar: Avatar, drive: Drive, z: Tensor | None) -> Float[np.ndarray, "V 3"]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from mitsuba_avatar.body.rig import Rig
@@ -27,6 +27,21 @@ class DrivingMasks:
 
     theta: Float32[Tensor, "D S S"]
     face: Float32[Tensor, "S S"]
+
+
+@dataclass(frozen=True, eq=False)
+class DrivingRegions:
+    """The same on the surface itself: theta [D, V], one row per pose angle, face [V]; True where the signal governs a vertex."""
+
+    theta: Bool[np.ndarray, "D V"]
+    face: Bool[np.ndarray, "V"]
+
+
+def driving_regions(rig: Rig) -> DrivingRegions:
+    """Vertices that each pose angle, and the face signal, govern: what `driving_masks` looks for in its cells, without widening."""
+    joints, row_of_dof = np.unique(rig.dofs.joints, return_inverse=True)
+    influence = np.stack([_influence(rig, int(joint)) for joint in joints])
+    return DrivingRegions(theta=influence[row_of_dof] > WEIGHT_THRESHOLD, face=rig.face_region > WEIGHT_THRESHOLD)
 
 
 def driving_masks(rig: Rig, size: int = 32) -> DrivingMasks:

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from mitsuba_avatar.ablation.measures import (
+from mitsuba_avatar.analysis.measures import (
     Splits,
     Study,
     disentanglement,
-    face_region,
     geometry_errors,
     image_errors,
     spurious_effects,
@@ -91,8 +90,3 @@ def test_a_face_that_moves_the_body_is_found(study: Study, monkeypatch: pytest.M
     leak = spurious_effects(study)
     assert leak["face_moves_body_mm"] > 5 > honest["face_moves_body_mm"]
     assert leak["pose_moves_face_mm"] == 0
-
-
-def test_the_face_region_holds_all_landmarks_and_not_all_of_the_body(study: Study):
-    region = face_region(study.rig)
-    assert region[study.rig.face_keypoint_vertices].all() and 0 < region.mean() < 1

@@ -1,0 +1,26 @@
+"""The analysis of a run, from end to end."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsuba_avatar.analyze import main
+
+
+@pytest.mark.usefixtures("one_thread", "private_cache")
+def test_report_and_pictures_are_written(fitted_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    assert main([str(fitted_run), "--out", str(tmp_path / "analysis"), "--frames", "2"]) == 0
+    report = json.loads((tmp_path / "analysis" / "report.json").read_text())
+    assert json.loads(capsys.readouterr().out) == report
+    assert report["geometry"]["test"]["driven_mm"] > 0 and 0 <= report["share_outside_region"]["face"] <= 1
+    for name in ("effects", "geometry", "uncertainty_shape", "uncertainty_texture"):
+        with Image.open(tmp_path / "analysis" / f"{name}.png") as picture:
+            assert len(np.unique(np.asarray(picture.convert("L")))) > 10
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture):
+    assert main([str(tmp_path)]) == 2
+    assert "analyze: RunFolder.open(): expected a run" in capsys.readouterr().err
