@@ -7,6 +7,8 @@
 | normal   | [H, W, 3]  | normal.X normal.Y normal.Z        | unit vectors, world axes               |
 | position | [H, W, 3]  | position.X position.Y position.Z  | metres, world axes                     |
 | uv       | [H, W, 2]  | uv.U uv.V                         | texture coordinates                    |
+| albedo   | [H, W, 3]  | albedo.R albedo.G albedo.B        | diffuse reflectance, premultiplied     |
+| ambient_occlusion | [H, W] | ambient_occlusion            | 1 where open, premultiplied            |
 | mask     | [H, W]     | mask                              | coverage, 0..1                         |
 
 The colour space is recorded twice, as the standard `chromaticities` and as the colour interop identifier of OpenEXR 3.4.
@@ -27,6 +29,8 @@ _CHANNELS = {
     "normal": ("normal.X", "normal.Y", "normal.Z"),
     "position": ("position.X", "position.Y", "position.Z"),
     "uv": ("uv.U", "uv.V"),
+    "albedo": ("albedo.R", "albedo.G", "albedo.B"),
+    "ambient_occlusion": ("ambient_occlusion",),
     "mask": ("mask",),
 }
 _COLOUR_SPACE = "lin_rec709_scene"
@@ -34,14 +38,15 @@ _REC_709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  
 _LARGEST_HALF = 65504.0
 
 
-def write_exr(path: Path | str, layers: Mapping[str, Float[np.ndarray, "H W *C"]], half: bool = False) -> None:
+def write_exr(path: Path | str, layers: Mapping[str, Float[np.ndarray, "H W *C"]], half: bool = False, comments: str = "") -> None:
     """Write one picture, whole or not at all, ZIP-compressed.
 
     Args:
         path: file to write.
         layers: layer name -> values, as in the module's table; float32 unless `half`.
-        half: store colour and mask as 16-bit floats (larger values are cut at 65504). Geometry stays 32-bit: half metres at 4 m
-            are steps of 4 mm.
+        half: store colour, albedo, occlusion and mask as 16-bit floats (larger values are cut at 65504). Geometry stays 32-bit: half
+            metres at 4 m are steps of 4 mm.
+        comments: the header's standard attribute of that name, for instance what the picture was made with.
 
     Raises:
         ValueError: an unknown layer, a wrong number of channels, layers of different sizes, or none.
@@ -54,7 +59,7 @@ def write_exr(path: Path | str, layers: Mapping[str, Float[np.ndarray, "H W *C"]
         raise ValueError(f"write_exr(): expected layers of one height and width; got {sizes}. Render them at one size.")
     channels = {}
     for name, values in layers.items():
-        dtype = np.float16 if half and name in ("colour", "mask") else np.float32
+        dtype = np.float16 if half and name in ("colour", "albedo", "ambient_occlusion", "mask") else np.float32
         for channel, plane in zip(_channel_names(name, values), _planes(values), strict=True):
             stored = np.clip(plane, -_LARGEST_HALF, _LARGEST_HALF) if dtype is np.float16 else plane
             channels[channel] = np.ascontiguousarray(stored, dtype=dtype)
@@ -64,6 +69,8 @@ def write_exr(path: Path | str, layers: Mapping[str, Float[np.ndarray, "H W *C"]
         "chromaticities": _REC_709_CHROMATICITIES,
         "colorInteropID": _COLOUR_SPACE,
     }
+    if comments:
+        header["comments"] = comments
     with atomic_path(path) as temporary, OpenEXR.File(header, channels) as file:
         try:
             file.write(str(temporary))

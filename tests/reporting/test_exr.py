@@ -10,7 +10,8 @@ from mitsuba_avatar.reporting.exr import read_exr, write_exr
 @pytest.fixture
 def layers():
     random = np.random.default_rng(2)
-    shapes = {"colour": (5, 8, 4), "depth": (5, 8), "normal": (5, 8, 3), "position": (5, 8, 3), "uv": (5, 8, 2), "mask": (5, 8)}
+    shapes = {"colour": (5, 8, 4), "depth": (5, 8), "normal": (5, 8, 3), "position": (5, 8, 3), "uv": (5, 8, 2), "albedo": (5, 8, 3)}
+    shapes |= {"ambient_occlusion": (5, 8), "mask": (5, 8)}
     return {name: random.normal(0, 3, shape).astype(np.float32) for name, shape in shapes.items()}
 
 
@@ -35,12 +36,13 @@ def test_half_rounds_colour_and_mask_and_leaves_geometry(tmp_path, layers):
 
 def test_channels_and_header_follow_the_standards(tmp_path, layers):
     layers["colour"] = layers["colour"][..., :3]
-    write_exr(tmp_path / "a.exr", layers)
+    write_exr(tmp_path / "a.exr", layers, comments="seed 3")
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         names, header = set(file.channels()), dict(file.header())
-    assert names == {"R", "G", "B", "depth.Z", "mask", "uv.U", "uv.V"} | {
+    assert names == {"R", "G", "B", "depth.Z", "ambient_occlusion", "mask", "uv.U", "uv.V", "albedo.R", "albedo.G", "albedo.B"} | {
         f"{layer}.{axis}" for layer in ("normal", "position") for axis in "XYZ"
     }
+    assert header["comments"] == "seed 3"
     assert header["colorInteropID"] == "lin_rec709_scene"
     assert header["chromaticities"][:2] == pytest.approx((0.64, 0.33))
     assert header["dataWindow"][1].tolist() == [7, 4]  # width, height: not exchanged
@@ -50,7 +52,10 @@ def test_channels_and_header_follow_the_standards(tmp_path, layers):
     ("layers", "message"),
     [
         ({}, "expected at least one layer"),
-        ({"color": np.zeros((2, 3, 3), np.float32)}, "expected a layer of colour, depth, normal, position, uv, mask; got 'color'"),
+        (
+            {"color": np.zeros((2, 3, 3), np.float32)},
+            "expected a layer of colour, depth, normal, position, uv, albedo, ambient_occlusion, mask; got 'color'",
+        ),
         ({"colour": np.zeros((2, 3, 2), np.float32)}, r"expected colour as \[H, W, 4\] .*; got \[2, 3, 2\]"),
         ({"depth": np.zeros((2, 3, 1), np.float32)}, r"expected depth .*; got \[2, 3, 1\]"),
         ({"colour": np.zeros((2, 3, 3), np.float32), "mask": np.zeros((3, 2), np.float32)}, "expected layers of one height and width"),
