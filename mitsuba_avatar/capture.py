@@ -1,7 +1,8 @@
-"""Look at a capture and check it: `python -m mitsuba_avatar.capture info|check PATH`.
+"""Look at a capture, check it, convert it: `python -m mitsuba_avatar.capture info|check PATH`, `convert --from FORMAT SOURCE PATH`.
 
 `info` lists cameras, frames and files. `check` reads all values, projects the mesh into every camera on a few frames, compares it
-with the masks, draws a contact sheet, and exits with 1 and the likely trap where they disagree.
+with the masks, draws a contact sheet, and exits with 1 and the likely trap where they disagree. `convert` writes a capture from
+another data set's files, or a Goliath body capture from a capture.
 """
 
 import os
@@ -29,7 +30,9 @@ from mitsuba_avatar.captures.contact_sheet import Tile, overlay, save_contact_sh
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.captures.reprojection import Diagnosis, Observation, diagnose
 from mitsuba_avatar.captures.rigid import inverse_rigid
+from mitsuba_avatar.converting import ConvertCommand, run_conversion
 from mitsuba_avatar.progress import progress_bar
+from mitsuba_avatar.rendering.backend import BackendError
 
 SHEET_CAMERAS = 8  # columns of the contact sheet; more are not readable
 FARTHEST_SURFACE = 0.25  # metres; mean distance of registered mesh and posed rig that loose clothing can explain
@@ -267,10 +270,15 @@ def _count_and_bytes(folder: Path) -> tuple[int, int]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 if all is well, 1 with one line on the error stream if the capture is not usable."""
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            {"info": info, "check": check}, prog="python -m mitsuba_avatar.capture", description=__doc__, args=arguments
+        chosen = tyro.extras.subcommand_cli_from_dict(
+            {"info": info, "check": check, "convert": ConvertCommand},
+            prog="python -m mitsuba_avatar.capture",
+            description=__doc__,
+            args=arguments,
         )
-    except (ValueError, OSError) as error:
+        if isinstance(chosen, ConvertCommand):
+            run_conversion(chosen)
+    except (ValueError, OSError, BackendError) as error:
         Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         return 1
     return 0

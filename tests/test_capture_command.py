@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mitsuba_avatar.body.rig import load_rig
 from mitsuba_avatar.capture import main
+from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.captures.formats.goliath import GoliathSource
+from tests.captures.formats.data_sets import write_thuman4
 from tests.small_capture import write_small_capture
 
 
@@ -151,3 +155,51 @@ def test_check_names_what_is_missing(folder, tmp_path, capsys, removed, message)
 def test_options_out_of_range_are_refused(whole, tmp_path, capsys):
     assert check(whole, tmp_path, "--frames", "0") == 1
     assert "expected at least 1 frame and 16 pixels; got 0 and 640" in capsys.readouterr().err
+
+
+BODY_FOLDER = "s--20260101--0000--TST001--pilot--ProjectGoliath--ClothedBody--3cams"
+
+
+def test_a_capture_goes_to_goliath_and_back_and_passes_the_check(whole, tmp_path, capsys):
+    """Rig, poses, face signal and registered mesh come back; the posed rig lies on the mesh, the mesh on the masks."""
+    exported = tmp_path / BODY_FOLDER
+    assert main(["convert", "--to", "goliath", "--occlusion-size", "32", str(whole), str(exported)]) == 0
+    assert "Wrote 3 cameras and 4 frames" in capsys.readouterr().out
+    options = ["--held-out-cameras", "high", "--fps", "10", "--last-frame", "105"]
+    assert main(["convert", "--from", "goliath", str(exported), str(tmp_path / "back"), *options]) == 0
+    text = capsys.readouterr().out
+    assert f"Wrote 3 cameras and 3 frames to {tmp_path / 'back'}" in text and "Missing for a fit" not in text
+    assert check(tmp_path / "back", tmp_path, "--minimum-iou", "0.95") == 0
+    assert "The capture is fine" in capsys.readouterr().out
+    occlusion = GoliathSource(exported).ambient_occlusion(1)
+    assert occlusion.shape == (32, 32) and 0.3 < occlusion.mean() < 1.0
+    back, original = Capture.open(tmp_path / "back"), Capture.open(whole)
+    np.testing.assert_allclose(back.theta, original.theta[:3], atol=1e-6)
+    np.testing.assert_allclose(back.vertices, original.vertices[:3], atol=1e-6)
+    assert back.description.held_out_cameras == ("high",) and back.face is not None
+    assert load_rig(back.rig_path).dofs.names == load_rig(original.rig_path).dofs.names
+
+
+def test_converting_without_a_body_says_what_is_missing(tmp_path, capsys):
+    (tmp_path / "data").mkdir()
+    write_thuman4(tmp_path / "data")
+    assert main(["convert", "--from", "thuman4", str(tmp_path / "data"), str(tmp_path / "out"), "--every", "2", "--scale", "0.5"]) == 0
+    text = capsys.readouterr().out
+    assert "Wrote 3 cameras and 2 frames" in text and "Undistorted or resized: images of 3 cameras" in text
+    assert "Missing for a fit: the body: rig.npz, pose.npy" in text and "mitsuba_avatar.register" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "expected --from FORMAT or --to goliath; got None and None"),
+        (["--from", "zju", "--to", "goliath"], "expected --from FORMAT or --to goliath; got zju and goliath"),
+        (["--from", "zju"], "expected a file at"),
+        (["--from", "actorshq", "--up", "x"], "calibration.csv; got none"),
+        (["--to", "goliath"], "expected a folder name with 'Body'"),
+    ],
+)
+def test_conversions_that_cannot_be_are_named(whole, tmp_path, capsys, words, message):
+    assert main(["convert", *words, str(whole), str(tmp_path / "out")]) == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out/capture.yaml").exists()

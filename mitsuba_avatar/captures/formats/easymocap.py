@@ -1,0 +1,156 @@
+"""EasyMocap folders: intri.yml and extri.yml of OpenCV, images/<camera>/<frame>, optional mask/<camera>/ and keypoints3d/.
+
+Cameras are world to camera in metres with pixel centres at integers; images keep their lens distortion, which `info.lenses` describes.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.spatial.transform import Rotation
+
+from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.captures.formats.decoding import parse_json
+from mitsuba_avatar.captures.formats.files import (
+    FilesByFrame,
+    FileSource,
+    camera_from_matrices,
+    extension_of,
+    files_by_number,
+    first_size,
+    needed,
+)
+from mitsuba_avatar.captures.formats.opencv_yaml import read_opencv_yaml
+from mitsuba_avatar.captures.formats.source import (
+    SourceInfo,
+    SourceOptions,
+    chosen_cameras,
+    common_frames,
+    timed_frames,
+    turned_camera,
+    turned_points,
+    upright_world,
+)
+from mitsuba_avatar.captures.undistortion import Lens
+
+FPS = 30.0
+MASK_FOLDERS = ("mask", "masks", "mask_cihp", "mask-schp")
+LACKS = ("the body: rig.npz, pose.npy, root.npy, face.npy, vertices.npy (SMPL parameters are no rig of ours)",)
+
+
+class EasyMocapSource(FileSource):
+    """An EasyMocap folder with triangulated keypoints.
+
+    Attributes:
+        person: identity to follow in keypoints3d; None takes the first of each frame.
+    """
+
+    def __init__(
+        self, path: Path, info: SourceInfo, images: FilesByFrame, masks: FilesByFrame, world_from_native: Float64[np.ndarray, "4 4"]
+    ):
+        super().__init__(info, images, masks, mask_is_label=True)
+        self.path, self._world_from_native = path, world_from_native
+        self.person: int | None = None
+
+    def keypoints(self, frame_index: int) -> Float32[np.ndarray, "K 4"] | None:
+        """Triangulated keypoints of the person, metres; confidence 0 throughout if nobody was found in this frame.
+
+        Raises:
+            ValueError: for a document of another schema.
+        """
+        number = self.info.frames[frame_index].number
+        found = self._people(number)
+        if found is None:
+            first = next((rows for frame in self.info.frames if (rows := self._people(frame.number)) is not None), None)
+            return None if first is None else np.zeros_like(first)
+        found[:, :3] = turned_points(found[:, :3], self._world_from_native)
+        return found
+
+    def _people(self, number: int) -> Float32[np.ndarray, "K 4"] | None:
+        """Keypoints of the person in one frame's file, in the data set's world."""
+        path = self.path / "keypoints3d" / f"{number:06d}.json"
+        if not path.is_file():
+            return None
+        document = parse_json(path.read_bytes(), str(path))
+        try:
+            people = {int(person["id"]): np.array(person["keypoints3d"], dtype=np.float32) for person in document}
+        except (TypeError, KeyError, ValueError) as error:
+            raise ValueError(
+                f"EasyMocapSource: expected [{{'id', 'keypoints3d': [[x, y, z, confidence], ...]}}, ...] in {path}; got "
+                f"{str(document)[:60]}. Triangulate again, or remove keypoints3d."
+            ) from error
+        if any(rows.ndim != 2 or rows.shape[1] not in (3, 4) for rows in people.values()):
+            raise ValueError(f"EasyMocapSource: expected rows of x, y, z, confidence in {path}; got other rows. Triangulate again.")
+        rows = people.get(self.person) if self.person is not None else next(iter(people.values()), None)
+        if rows is not None and rows.shape[1] == 3:
+            rows = np.concatenate([rows, np.ones_like(rows[:, :1])], axis=1)
+        return rows
+
+
+def open_easymocap(path: Path | str, options: SourceOptions = SourceOptions()) -> EasyMocapSource:  # noqa: B008 - frozen
+    """Open an EasyMocap folder.
+
+    Raises:
+        FileNotFoundError: if a calibration file is missing.
+        ValueError: for a calibration of another schema, a camera missing from it, or no frame that every camera has.
+    """
+    path = Path(path)
+    folder = path / "images"
+    recorded = sorted(entry.name for entry in folder.iterdir() if entry.is_dir()) if folder.is_dir() else []
+    intrinsics, extrinsics = read_opencv_yaml(path / "intri.yml"), read_opencv_yaml(path / "extri.yml")
+    listed = [str(name) for name in intrinsics.get("names") or []]
+    calibrated = [name for name in listed if f"K_{name}" in intrinsics and f"T_{name}" in extrinsics]
+    names, notes = chosen_cameras(calibrated, recorded, options.cameras, path)
+    images = {name: files_by_number(folder / name) for name in names}
+    mask_folder = next((path / name for name in MASK_FOLDERS if (path / name).is_dir()), path / MASK_FOLDERS[0])
+    masks = {name: files_by_number(mask_folder / name) for name in names}
+    numbers, missing = common_frames(None, needed(images, masks), path)
+    native = {name: _camera(name, intrinsics, extrinsics, first_size(images[name]), path) for name in names}
+    lenses = {name: _lens(name, intrinsics, path) for name in names} if options.distortion != "ignore" else {}
+    turn = upright_world(native.values(), options.up, path)
+    fps = options.fps or FPS
+    info = SourceInfo(
+        name=path.resolve().name,
+        fps=fps,
+        cameras={name: turned_camera(camera, turn) for name, camera in native.items()},
+        lenses={name: lens for name, lens in lenses.items() if not lens.is_pinhole},
+        frames=timed_frames(numbers, fps, options.test_frames),
+        missing=missing,
+        image_extension=extension_of(images),
+        has_masks=any(masks.values()),
+        lacks=LACKS,
+        notes=tuple(notes),
+        source=f"EasyMocap folder {path.resolve().name}",
+    )
+    return EasyMocapSource(path, info, images, masks, turn)
+
+
+def _camera(name: str, intrinsics: Mapping[str, Any], extrinsics: Mapping[str, Any], size: tuple[int, int], path: Path) -> Camera:
+    """A camera of both files, at the images' size, in the data set's world."""
+    stated = tuple(intrinsics.get(f"{axis}_{name}") for axis in "WH")
+    if None not in stated and tuple(map(int, stated)) != size:
+        raise ValueError(
+            f"open_easymocap(): expected images of {int(stated[0])}x{int(stated[1])} pixels for {name} by {path / 'intri.yml'}; got "
+            f"{size[0]}x{size[1]}. Scale K (and W, H) with the images."
+        )
+    rotation = extrinsics.get(f"Rot_{name}")
+    if not isinstance(rotation, np.ndarray):
+        vector = extrinsics.get(f"R_{name}")
+        if not isinstance(vector, np.ndarray) or vector.size != 3:
+            raise ValueError(
+                f"open_easymocap(): expected R_{name} (Rodrigues) or Rot_{name} (3x3) in {path / 'extri.yml'}; got neither. Calibrate."
+            )
+        rotation = Rotation.from_rotvec(vector.ravel()).as_matrix()
+    matrices = [np.asarray(value, dtype=np.float64) for value in (intrinsics[f"K_{name}"], rotation, extrinsics[f"T_{name}"])]
+    return camera_from_matrices(name, size, *matrices, path / "intri.yml")
+
+
+def _lens(name: str, intrinsics: Mapping[str, Any], path: Path) -> Lens:
+    """Lens of a camera."""
+    values = intrinsics.get(f"dist_{name}", intrinsics.get(f"D_{name}"))
+    try:
+        return Lens(() if values is None else tuple(float(value) for value in np.ravel(values)))
+    except ValueError as error:
+        raise ValueError(f"open_easymocap(): dist_{name} of {path / 'intri.yml'} is not usable. {error}") from error

@@ -1,0 +1,208 @@
+"""`capture convert`: other formats into our layout, and our layout into Goliath's.
+
+The readers know files, the body stage knows rigs; here they meet.
+"""
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float32
+from rich.console import Console
+
+from mitsuba_avatar.body.momentum_rig import face_signal, momentum_from_rig, momentum_poses, rig_from_momentum
+from mitsuba_avatar.body.rig import Rig, load_rig, save_rig
+from mitsuba_avatar.captures.arrays import open_frame_array
+from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.captures.formats.conversion import ConversionOptions, convert, read_report, with_frames
+from mitsuba_avatar.captures.formats.goliath import GoliathSource
+from mitsuba_avatar.captures.formats.goliath_writer import GoliathBody, write_goliath
+from mitsuba_avatar.captures.formats.opening import FormatName, open_source
+from mitsuba_avatar.captures.formats.source import Source, SourceOptions, UpAxis
+from mitsuba_avatar.captures.images import ImageExtension
+from mitsuba_avatar.captures.writer import CaptureWriter
+from mitsuba_avatar.progress import progress_bar
+from mitsuba_avatar.rendering.backend import select_variant
+
+OCCLUSION_RAYS = 32  # per texel
+OCCLUSION_METRES = 0.5  # what is farther away does not occlude
+
+
+@dataclass(frozen=True)
+class ConvertCommand:
+    """Convert a data set into a capture (--from), or a capture into a Goliath body capture (--to goliath).
+
+    Attributes:
+        source: Folder to read.
+        destination: Folder to write; an interrupted conversion resumes there.
+        from_format: Format of the source.
+        to_format: Format of the destination.
+        cameras: Read only these; default: all that have calibration and images.
+        held_out_cameras: Cameras that no training may look at.
+        first_frame: Leave out frames with lower numbers.
+        last_frame: Leave out frames with higher numbers.
+        every: Keep each so-manieth frame.
+        scale: Make images smaller by this factor.
+        image_extension: Of the images to write; default: as the source's.
+        fps: Frames per second; default: the format's.
+        test_frames: So many of the last frames are for testing; default: the data set's own split, else a tenth.
+        up: Axis of the data set's world that points up; default: as the cameras stand.
+        distortion: Apply or ignore the stored lens coefficients; default: as the data set's own tools do.
+        assets: Body model of Goliath captures (static_assets_body.pt or .npz); default: in or beside the capture.
+        links: Link to image files that need no change instead of copying them; the source must stay where it is.
+        occlusion_size: Texels of the ambient occlusion maps written with --to goliath; 0 leaves them out.
+    """
+
+    source: tyro.conf.Positional[Path]
+    destination: tyro.conf.Positional[Path]
+    from_format: Annotated[FormatName | None, tyro.conf.arg(name="from")] = None
+    to_format: Annotated[Literal["goliath"] | None, tyro.conf.arg(name="to")] = None
+    cameras: tuple[str, ...] = ()
+    held_out_cameras: tuple[str, ...] = ()
+    first_frame: int | None = None
+    last_frame: int | None = None
+    every: int = 1
+    scale: float = 1.0
+    image_extension: ImageExtension | None = None
+    fps: float = 0.0
+    test_frames: int = -1
+    up: UpAxis = "auto"
+    distortion: Literal["auto", "apply", "ignore"] = "auto"
+    assets: Path | None = None
+    links: bool = False
+    occlusion_size: int = 0
+
+
+def run_conversion(command: ConvertCommand) -> None:
+    """Convert, and print what was written, left out, and is still missing for a fit.
+
+    Raises:
+        ValueError, FileNotFoundError, FileExistsError: the command or a file cannot be used; the destination stays unfinished.
+    """
+    if (command.from_format is None) == (command.to_format is None):
+        raise ValueError(
+            f"convert(): expected --from FORMAT or --to goliath; got {command.from_format} and {command.to_format}. Give one of them."
+        )
+    if command.to_format is not None:
+        _export(command)
+    else:
+        _import(command)
+
+
+def _import(command: ConvertCommand) -> None:
+    """Another format into ours."""
+    options = SourceOptions(command.cameras, command.fps, command.test_frames, command.up, command.distortion, command.assets)
+    source = with_frames(open_source(command.from_format, command.source, options), command.first_frame, command.last_frame)
+    body = _MomentumBody(source) if isinstance(source, GoliathSource) and source.tracking_is_there else None
+    conversion = ConversionOptions(
+        command.scale, command.held_out_cameras, command.image_extension, command.every, body is not None, command.links
+    )
+    capture = (
+        convert(source, command.destination, conversion, track=track)
+        if body is None
+        else convert(source, command.destination, conversion, body.add, track)
+    )
+    _print_summary(capture, source)
+
+
+class _MomentumBody:
+    """Adds the rig of a Goliath capture, its poses, and the face signal of its registered meshes."""
+
+    def __init__(self, source: GoliathSource):
+        self.source = source
+
+    def add(self, writer: CaptureWriter, indices: tuple[int, ...]) -> Sequence[str]:
+        """Write rig, poses and face; returns what the rig cannot do."""
+        tracking = self.source.tracking()
+        tracked = rig_from_momentum(tracking)
+        rows = list(indices)
+        theta, root = tracked.theta[rows], tracked.root[rows]
+        with TemporaryDirectory() as folder:
+            save_rig(Path(folder) / "rig.npz", tracked.rig)
+            writer.write_rig(Path(folder) / "rig.npz")
+        writer.write_arrays(theta=theta, root=root)
+        vertices = open_frame_array(writer.path, "vertices", len(rows))
+        if vertices is None:
+            return (*tracked.notes, "no registered meshes: no face signal, and model.use_latent must be false")
+        if vertices.shape[1] != tracked.rig.topology.num_vertices:
+            raise ValueError(
+                f"convert(): expected {tracked.rig.topology.num_vertices} registered vertices, those of {self.source.assets_path}; got "
+                f"{vertices.shape[1]}. Take model and capture of one release."
+            )
+        writer.write_arrays(face=face_signal(tracked.rig, theta, root, vertices))
+        return tracked.notes
+
+
+def _export(command: ConvertCommand) -> None:
+    """Ours into Goliath's."""
+    capture = Capture.open(command.source, command.scale)
+    body = None
+    if capture.rig_path.is_file() and capture.theta is not None and capture.root is not None:
+        rig = load_rig(capture.rig_path)
+        occlusion = _occlusion(capture, rig, command.occlusion_size) if command.occlusion_size else None
+        body = GoliathBody(momentum_from_rig(rig), momentum_poses(np.array(capture.theta), np.array(capture.root)), occlusion)
+    path = write_goliath(capture, command.destination, body, track)
+    console = Console()
+    console.print(f"Wrote {len(capture.cameras)} cameras and {len(capture.frames)} frames to {path}.", highlight=False, soft_wrap=True)
+    if body is None:
+        console.print("Left out: body model and poses, because the capture has no rig.npz, pose.npy or root.npy.", highlight=False)
+
+
+def _occlusion(capture: Capture, rig: Rig, size: int) -> Callable[[int], Float32[np.ndarray, "S S"]]:
+    """Frame index -> ambient occlusion [S, S] of the registered mesh, or of the posed template."""
+    # Imported here, because it loads Mitsuba, which no other conversion needs; a variant that is set already stays.
+    loaded = sys.modules.get("mitsuba")
+    if loaded is None or loaded.variant() is None:
+        select_variant("auto")
+    from mitsuba_avatar.body.skeleton import Skeleton
+    from mitsuba_avatar.body.skinning import pose_vertices
+    from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
+
+    tracer, skeleton = AmbientOcclusion(rig.topology, size, OCCLUSION_RAYS, OCCLUSION_METRES), Skeleton(rig)
+
+    def occlusion(index: int) -> Float32[np.ndarray, "S S"]:
+        with torch.no_grad():
+            if capture.vertices is not None:
+                vertices = torch.from_numpy(np.array(capture.vertices[index]))
+            else:
+                transforms = skeleton(torch.from_numpy(np.array(capture.theta[[index]])), torch.from_numpy(np.array(capture.root[[index]])))
+                vertices = pose_vertices(torch.from_numpy(rig.rest_vertices)[None], transforms, torch.from_numpy(rig.skinning_weights))[0]
+            return tracer.bake(vertices).cpu().numpy()
+
+    return occlusion
+
+
+def track(items: Sequence, description: str) -> Iterator:
+    """The items one by one, with a progress bar."""
+    with progress_bar(description, len(items)) as bar:
+        for done, item in enumerate(items, start=1):
+            yield item
+            bar.update(done)
+
+
+def _print_summary(capture: Capture, source: Source) -> None:
+    """What was converted, left out, and is missing."""
+    console = Console()
+    report = read_report(capture.path)
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+    say(f"Wrote {len(capture.cameras)} cameras and {len(capture.frames)} frames to {capture.path}.")
+    if report["remapped_cameras"]:
+        say(f"Undistorted or resized: images of {len(report['remapped_cameras'])} cameras.")
+    for reason, count in source.info.missing_reasons().items():
+        say(f"Left out: {count} frames, {reason}.")
+    for note in report["notes"]:
+        say(f"Note: {note}.")
+    lacks = list(report["lacks"]) + ([] if source.info.has_masks else ["masks of the person"])
+    for what in lacks:
+        say(f"Missing for a fit: {what}.")
+    if lacks:
+        say("`python -m mitsuba_avatar.register` makes masks and a body from images and keypoints.")
