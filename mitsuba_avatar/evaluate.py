@@ -1,12 +1,13 @@
 """Measure a fitted avatar: `python -m mitsuba_avatar.evaluate RUN [--capture DIR] [--frames N]`.
 
-Prints the table of the avatar and the baselines over train and test frames, seen and held-out cameras, and writes metrics.json.
+Prints tables of the avatar and the baselines over train and test frames, seen and held-out cameras, one for each protocol (mask, image,
+box: docs/reports.md), and writes metrics.json and, with a row for every picture, metrics.csv.
 """
 
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -22,7 +23,10 @@ class EvaluateCommand:
     capture: str = ""  # another capture of the same rig; default: the one it was trained on
     frames: int = 0  # frames per split; default: the run's setting evaluation.frames_per_split
     checkpoint: str = "last"  # best or last
-    output: str = ""  # where metrics go; default: RUN/metrics.json
+    output: str = ""  # where metrics go; default: RUN/metrics.json; the pictures' CSV lies beside it
+    protocols: tuple[Literal["mask", "image", "box"], ...] = ("mask", "image", "box")  # regions that image errors are averaged over
+    flip: bool = True  # measure FLIP, which takes longer than everything else
+    flicker_frames: int = 4  # frames per split whose flicker is measured; 0 for none
     variant: str = "auto"  # Mitsuba variant
 
 
@@ -32,6 +36,11 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if command.frames < 0:
             raise ValueError(f"expected --frames of at least 1, or 0 for the run's own number; got {command.frames}.")
+        if command.flicker_frames < 0 or not command.protocols:
+            raise ValueError(
+                f"expected --flicker-frames of 0 or more and at least one of --protocols; got {command.flicker_frames} and "
+                f"{command.protocols}."
+            )
         backend.select_variant(command.variant)
         return _evaluate(command)
     except (ValueError, OSError, backend.BackendError) as error:
@@ -43,6 +52,7 @@ def _evaluate(command: EvaluateCommand) -> int:
     # Imported after the variant is set, because these modules load torch and Dr.Jit.
     from mitsuba_avatar.loaded_run import LoadedRun
     from mitsuba_avatar.progress import progress_bar
+    from mitsuba_avatar.reporting.evaluation import Measures
     from mitsuba_avatar.reporting.tables import terminal_table
 
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
@@ -50,10 +60,17 @@ def _evaluate(command: EvaluateCommand) -> int:
     check_writable(output.parent)
     evaluator = loaded.evaluator()
     frames = evaluator.split_frames(command.frames or loaded.run.settings.evaluation.frames_per_split)
+    measures = Measures(command.protocols, has_flip=command.flip, has_seams=True)
     with progress_bar("evaluating", sum(map(len, frames.values()))) as bar:
-        metrics = evaluator.measure(frames, progress=bar.update)
+        metrics = evaluator.measure(frames, progress=bar.update, measures=measures)
+    if command.flicker_frames:
+        moments = evaluator.split_frames(command.flicker_frames)
+        with progress_bar("flicker", sum(map(len, moments.values()))) as bar:
+            metrics.absorb(evaluator.measure_flicker(moments, progress=bar.update))
     metrics.save(output)
-    sys.stdout.write(terminal_table(metrics.means()) + "\n")
+    metrics.save_pictures(output.with_suffix(".csv"))
+    for protocol in command.protocols:
+        sys.stdout.write(f"protocol {protocol}\n{terminal_table(metrics.means(), protocol)}\n\n")
     return 0
 
 

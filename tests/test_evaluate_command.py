@@ -8,7 +8,7 @@ import pytest
 
 from mitsuba_avatar.evaluate import main
 from mitsuba_avatar.reporting.evaluation import METHODS
-from mitsuba_avatar.reporting.metrics import load_metrics
+from mitsuba_avatar.reporting.metrics import load_metrics, load_pictures
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -22,13 +22,17 @@ def test_evaluation_repeats_what_the_fit_measured(fitted_run, private_cache, tmp
                 for name, value in first[method][split][cameras].items():
                     assert again[method][split][cameras][name] == pytest.approx(value, rel=1e-3, abs=1e-3), (method, split, cameras, name)
     table = capsys.readouterr().out
+    assert [line for line in table.splitlines() if line.startswith("protocol")] == ["protocol mask", "protocol image", "protocol box"]
+    assert {"flip", "box_flip", "image_ssim", "seam", "flicker"} <= set(again["avatar"]["test"]["seen"])
+    assert len([row for row in load_pictures(tmp_path / "metrics.csv") if "psnr" in row]) == 3 * 5 * 4
     assert all(f"{method} " in table for method in METHODS) and "held_out" in table and "PSNR (dB)" in table
 
 
 def test_frames_and_checkpoint_can_be_chosen(fitted_run, private_cache, tmp_path):
     shutil.copytree(fitted_run, tmp_path / "run")
-    assert main([str(tmp_path / "run"), "--frames", "1", "--checkpoint", "last"]) == 0
-    assert load_metrics(tmp_path / "run/metrics.json")["avatar"]["train"]["seen"]["images"] == 4
+    assert main([str(tmp_path / "run"), "--frames", "1", "--checkpoint", "last", "--no-flip", "--protocols", "box"]) == 0
+    values = load_metrics(tmp_path / "run/metrics.json")["avatar"]["train"]["seen"]
+    assert values["images"] == 4 and "box_psnr" in values and "psnr" not in values and "box_flip" not in values
 
 
 def test_held_out_cameras_are_those_of_the_run(fitted_run, private_cache, tmp_path):
@@ -57,6 +61,7 @@ def lose_capture(run):
         (forget_checkpoints, [], "no checkpoint in"),
         (lose_capture, [], "/gone; got none"),
         (lambda run: None, ["--frames", "-1"], "expected --frames of at least 1"),
+        (lambda run: None, ["--flicker-frames", "-2"], "expected --flicker-frames of 0 or more"),
         (lambda run: None, ["--checkpoint", "newest"], "expected checkpoint 'best' or 'last'; got 'newest'"),
         (lambda run: None, ["--output", "/dev/null/metrics.json"], "got /dev/null, which is a file"),
         (lambda run: None, ["--variant", "scalar_rgb"], "scalar_rgb"),

@@ -18,7 +18,9 @@ from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
-from mitsuba_avatar.reporting.metrics import MetricsAccumulator, image_metrics, silhouette_iou, vertex_error_mm
+from mitsuba_avatar.reporting.metrics import MetricsAccumulator, silhouette_iou, temporal_flicker, vertex_error_mm
+from mitsuba_avatar.reporting.protocols import PROTOCOLS, Protocol, protocol_metrics
+from mitsuba_avatar.reporting.seams import SeamSampler
 from mitsuba_avatar.training.batches import FrameBatch, FrameReader
 from mitsuba_avatar.training.statistics import evenly_spaced
 
@@ -33,11 +35,31 @@ class Drawn:
         images: [B, 3, H, W] display-encoded, composited.
         masks: [B, 1, H, W].
         vertices: [V, 3] metres; None where the method has no mesh.
+        texture: [3, T, T] linear radiance towards the first camera; None where the method has no texture.
     """
 
     images: Float[Tensor, "B 3 H W"]
     masks: Float[Tensor, "B 1 H W"]
     vertices: Float[Tensor, "V 3"] | None
+    texture: Float[Tensor, "3 T T"] | None = None
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is measured of a picture beside silhouette and mesh.
+
+    Attributes:
+        protocols: regions that image errors are averaged over.
+        has_flip: FLIP too; it takes longer than all the others together.
+        has_seams: the difference across the texture's seams too.
+    """
+
+    protocols: tuple[Protocol, ...] = ("mask",)
+    has_flip: bool = False
+    has_seams: bool = False
+
+
+EVERY_MEASURE = Measures(PROTOCOLS, has_flip=True, has_seams=True)
 
 
 class Evaluator:
@@ -53,6 +75,7 @@ class Evaluator:
         self.avatar, self.reader, self.renderer = avatar, reader, renderer
         self.capture: Capture = reader.capture
         self.train_frames = self.capture.frame_indices("train")
+        self._seams: SeamSampler | None = None
 
     @torch.no_grad()
     def draw(self, method: str, batch: FrameBatch) -> Drawn:
@@ -69,7 +92,7 @@ class Evaluator:
             textures = avatar.mean_texture.expand(len(batch.cameras), -1, -1, -1)
         radiance, masks = self.renderer.render(vertices, textures, batch.cameras, seed=batch.frames[0], background=batch.backgrounds)
         images = encode(radiance, "srgb")
-        return Drawn(images.clamp(0, 1).cpu(), masks.cpu(), vertices[0].cpu())
+        return Drawn(images.clamp(0, 1).cpu(), masks.cpu(), vertices[0].cpu(), textures[0].cpu())
 
     def measure(
         self,
@@ -77,6 +100,7 @@ class Evaluator:
         methods: Sequence[str] = METHODS,
         camera_names: Sequence[str] | None = None,
         progress: Callable[[int, int], None] = lambda done, total: None,
+        measures: Measures = Measures(),  # noqa: B008 - frozen
     ) -> MetricsAccumulator:
         """Errors of every method over chosen frames of each split, all cameras or chosen ones.
 
@@ -85,6 +109,7 @@ class Evaluator:
             methods: of METHODS.
             camera_names: None for all.
             progress: called as progress(done, total), in frames.
+            measures: which errors.
         """
         result = MetricsAccumulator()
         names = list(camera_names or self.capture.camera_names())
@@ -94,17 +119,49 @@ class Evaluator:
             for index in indices:
                 batch = self.reader.read([index], [names])
                 references, masks = as_images(batch.images), batch.masks[:, 0].numpy()
+                number = self.capture.frames[index].number
                 for method in methods:
                     drawn = self.draw(method, batch)
                     images = as_images(drawn.images)
+                    of_frame = self._frame_metrics(drawn, batch, measures)
                     for view, name in enumerate(names):
                         if not masks[view].any():
                             continue  # the person is outside this camera's image
-                        values = image_metrics(images[view], references[view], masks[view])
+                        values = protocol_metrics(images[view], references[view], masks[view], measures.protocols, measures.has_flip)
                         values["iou"] = silhouette_iou(drawn.masks[view, 0].numpy(), masks[view])
-                        if drawn.vertices is not None and batch.vertices is not None:
-                            values["vertex_mm"] = vertex_error_mm(drawn.vertices.numpy(), batch.vertices[0].numpy())
-                        result.add(method, split, "held_out" if name in held_out else "seen", values)
+                        result.add(method, split, "held_out" if name in held_out else "seen", values | of_frame, (name, number))
+                done += 1
+                progress(done, total)
+        return result
+
+    def measure_flicker(
+        self,
+        frames: dict[str, list[int]],
+        methods: Sequence[str] = METHODS,
+        camera_names: Sequence[str] | None = None,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> MetricsAccumulator:
+        """Temporal flicker (`temporal_flicker`) between chosen frames and their neighbours in time; arguments are those of `measure`.
+
+        A frame's neighbour is the one after it, before it at a segment's end; frames of segments of one frame have none and are left out.
+        """
+        result = MetricsAccumulator()
+        names = list(camera_names or self.capture.camera_names())
+        held_out = set(self.capture.camera_names(held_out=True))
+        total, done = sum(map(len, frames.values())), 0
+        for split, indices in frames.items():
+            for index in indices:
+                pair = self._neighbours(index)
+                batches = [self.reader.read([frame], [names]) for frame in pair]
+                references = np.stack([as_images(batch.images) for batch in batches], axis=1)  # [B, 2, H, W, 3]
+                masks = np.stack([batch.masks[:, 0].numpy() for batch in batches], axis=1)
+                number = self.capture.frames[index].number
+                for method in methods if len(pair) == 2 else ():
+                    images = np.stack([as_images(self.draw(method, batch).images) for batch in batches], axis=1)
+                    for view, name in enumerate(names):
+                        if masks[view].any():
+                            values = {"flicker": temporal_flicker(images[view], references[view], masks[view])}
+                            result.add(method, split, "held_out" if name in held_out else "seen", values, (name, number))
                 done += 1
                 progress(done, total)
         return result
@@ -113,6 +170,25 @@ class Evaluator:
         """At most `per_split` evenly spaced frames of each split that the capture has."""
         splits = {frame.split for frame in self.capture.frames}
         return {split: evenly_spaced(self.capture.frame_indices(split), per_split) for split in ("train", "test") if split in splits}
+
+    def _frame_metrics(self, drawn: Drawn, batch: FrameBatch, measures: Measures) -> dict[str, float]:
+        """Errors that all cameras of a frame share."""
+        values = {}
+        if drawn.vertices is not None and batch.vertices is not None:
+            values["vertex_mm"] = vertex_error_mm(drawn.vertices.numpy(), batch.vertices[0].numpy())
+        if measures.has_seams and drawn.texture is not None:
+            self._seams = self._seams or SeamSampler(self.renderer.topology)
+            values["seam"] = self._seams.difference(drawn.texture)
+        return values
+
+    def _neighbours(self, index: int) -> list[int]:
+        """A frame and the next of its segment and split, in order of time; the one before it at the end; alone where there is neither."""
+        frames = self.capture.frames
+        place = (frames[index].split, frames[index].segment)
+        for pair in ([index, index + 1], [index - 1, index]):
+            if all(0 <= i < len(frames) and (frames[i].split, frames[i].segment) == place for i in pair):
+                return pair
+        return [index]
 
     def _draw_nearest(self, batch: FrameBatch) -> Drawn:
         """The captured images of the training frame nearest in pose angles; for a training frame, the nearest other one."""

@@ -4,6 +4,7 @@ Images are display-encoded (sRGB), [H, W, 3] in 0..1, because that is what eyes 
 0..1 and weigh the pixels, so that a half-covered pixel counts half. Sums run in float64.
 """
 
+import csv
 import json
 import math
 from collections.abc import Mapping
@@ -19,6 +20,8 @@ from mitsuba_avatar.files import atomic_path
 Split = Literal["train", "test"]
 CameraGroup = Literal["seen", "held_out"]
 
+PICTURE_COLUMNS = ("method", "split", "cameras", "camera", "frame")  # of a CSV with a row a picture; metrics follow
+
 # Mean square of the rounding error of an 8-bit image, in 0..255 values. Two equal images count as this far apart, not as 0, so that
 # PSNR stays finite (58.9 dB) and means of it exist.
 _ROUNDING_MSE = 1 / 12
@@ -26,12 +29,12 @@ _ROUNDING_MSE = 1 / 12
 
 def l1_in_mask(image: Float[np.ndarray, "H W 3"], reference: Float[np.ndarray, "H W 3"], mask: Float[np.ndarray, "H W"]) -> float:
     """Mean absolute difference inside the mask, in 0..255 values, over pixels and channels."""
-    return _mean_in_mask(255 * np.abs(_difference("l1_in_mask", image, reference)).mean(axis=-1), mask, "l1_in_mask")
+    return mean_over(255 * np.abs(_difference("l1_in_mask", image, reference)).mean(axis=-1), mask, "l1_in_mask")
 
 
 def mse_in_mask(image: Float[np.ndarray, "H W 3"], reference: Float[np.ndarray, "H W 3"], mask: Float[np.ndarray, "H W"]) -> float:
     """Mean squared difference inside the mask, in squared 0..255 values: the error that the paper's tables give."""
-    return _mean_in_mask(np.square(255 * _difference("mse_in_mask", image, reference)).mean(axis=-1), mask, "mse_in_mask")
+    return mean_over(np.square(255 * _difference("mse_in_mask", image, reference)).mean(axis=-1), mask, "mse_in_mask")
 
 
 def psnr_from_mse(mse: float) -> float:
@@ -47,7 +50,12 @@ def ssim_in_mask(image: Float[np.ndarray, "H W 3"], reference: Float[np.ndarray,
 
     Source: Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity, 2004, equations 13 to 16.
     """
-    _difference("ssim_in_mask", image, reference)
+    return mean_over(ssim_map(image, reference), mask, "ssim_in_mask")
+
+
+def ssim_map(image: Float[np.ndarray, "H W 3"], reference: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    """Structural similarity around every pixel, mean of the channels; the parameters are those of `ssim_in_mask`."""
+    _difference("ssim_map", image, reference)
     x, y = image.astype(np.float64), reference.astype(np.float64)
     mean_x, mean_y = _window_mean(x), _window_mean(y)
     variance_x = _window_mean(x * x) - mean_x**2
@@ -55,7 +63,15 @@ def ssim_in_mask(image: Float[np.ndarray, "H W 3"], reference: Float[np.ndarray,
     covariance = _window_mean(x * y) - mean_x * mean_y
     c1, c2 = 0.01**2, 0.03**2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2) / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))
-    return _mean_in_mask(similarity.mean(axis=-1), mask, "ssim_in_mask")
+    return similarity.mean(axis=-1)
+
+
+def difference_maps(
+    image: Float[np.ndarray, "H W 3"], reference: Float[np.ndarray, "H W 3"]
+) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+    """Absolute and squared difference of every pixel in 0..255 values, each the mean over its channels."""
+    difference = 255 * _difference("difference_maps", image, reference)
+    return np.abs(difference).mean(axis=-1), np.square(difference).mean(axis=-1)
 
 
 def silhouette_iou(mask: Float[np.ndarray, "H W"], reference: Float[np.ndarray, "H W"]) -> float:
@@ -77,6 +93,39 @@ def vertex_error_mm(vertices: Float[np.ndarray, "V 3"], reference: Float[np.ndar
     return float(1000 * np.linalg.norm(vertices.astype(np.float64) - reference, axis=-1).mean())
 
 
+def mean_over(values: Float[np.ndarray, "H W"], mask: Float[np.ndarray, "H W"], caller: str = "mean_over") -> float:
+    """Mean of a map weighted by a mask, in float64; `caller` is who complains of wrong sizes and empty masks."""
+    if values.shape != mask.shape:
+        raise ValueError(f"{caller}(): expected a mask of {values.shape}; got {mask.shape}. Resize image and mask together.")
+    weight = mask.sum(dtype=np.float64)
+    if weight <= 0:
+        raise ValueError(
+            f"{caller}(): expected a mask that covers something; got an empty one. Leave this picture out: the camera sees nobody."
+        )
+    return float((values * mask).sum() / weight)
+
+
+def temporal_flicker(
+    images: Float[np.ndarray, "2 H W 3"], references: Float[np.ndarray, "2 H W 3"], masks: Float[np.ndarray, "2 H W"]
+) -> float:
+    """What a render changes from one frame to the next that the capture does not, and the other way round, in 0..255 values.
+
+    The mean absolute difference of the two changes, over the pixels of either mask. A constant error does not flicker: it costs nothing
+    here as long as it stays where it is; so does a frozen picture of a frozen person.
+
+    Args:
+        images: a method's two pictures of neighbouring frames, seen by one camera.
+        references: the capture's.
+        masks: the capture's.
+
+    Raises:
+        ValueError: if the sizes differ, or if both masks are empty.
+    """
+    _difference("temporal_flicker", images, references)
+    change = (images[1].astype(np.float64) - images[0]) - (references[1].astype(np.float64) - references[0])
+    return mean_over(255 * np.abs(change).mean(axis=-1), masks.max(axis=0), "temporal_flicker")
+
+
 def image_metrics(
     image: Float[np.ndarray, "H W 3"], reference: Float[np.ndarray, "H W 3"], mask: Float[np.ndarray, "H W"]
 ) -> dict[str, float]:
@@ -94,8 +143,16 @@ class MetricsAccumulator:
 
     def __init__(self) -> None:
         self._values: dict[tuple[str, str, str], dict[str, list[float]]] = {}
+        self._pictures: dict[tuple[str, str, str, str, int | None], dict[str, float]] = {}
 
-    def add(self, method: str, split: Split, cameras: CameraGroup, values: Mapping[str, float]) -> None:
+    def add(
+        self,
+        method: str,
+        split: Split,
+        cameras: CameraGroup,
+        values: Mapping[str, float],
+        picture: tuple[str, int] | None = None,
+    ) -> None:
         """Count one picture.
 
         Args:
@@ -103,6 +160,7 @@ class MetricsAccumulator:
             split: of the frame.
             cameras: whether the camera was seen in training.
             values: metric name -> value; the same names for every picture of a key.
+            picture: camera and frame number, for `save_pictures`; None leaves the picture out there.
 
         Raises:
             ValueError: a value that is not finite, or names other than the first picture's.
@@ -120,13 +178,32 @@ class MetricsAccumulator:
             )
         for name, value in values.items():
             known[name].append(float(value))
+        if picture is not None:
+            self._pictures[(method, split, cameras, *picture)] = {name: float(value) for name, value in values.items()}
+
+    def absorb(self, other: "MetricsAccumulator") -> None:
+        """Take over metrics that were measured on their own, over other pictures: `images` keeps the count of what was here.
+
+        Raises:
+            ValueError: a metric that is here already.
+        """
+        for key, values in other._values.items():
+            known = self._values.setdefault(key, {})
+            repeated = sorted(known.keys() & values.keys())
+            if repeated:
+                raise ValueError(
+                    f"MetricsAccumulator.absorb(): expected new metrics for {key}; got {repeated} again. Measure each of them once."
+                )
+            known.update({name: list(numbers) for name, numbers in values.items()})
+        for key, values in other._pictures.items():
+            self._pictures[key] = self._pictures.get(key, {}) | values
 
     def means(self) -> dict[str, Any]:
         """Nested dictionaries `[method][split][cameras][metric]`, in the order in which the keys came."""
         result: dict[str, Any] = {}
         for (method, split, cameras), values in self._values.items():
             means: dict[str, float] = {name: math.fsum(numbers) / len(numbers) for name, numbers in values.items()}
-            means["images"] = max(map(len, values.values()), default=0)
+            means["images"] = len(next(iter(values.values()), ()))  # of the metrics that came first: absorbed ones have their own number
             result.setdefault(method, {}).setdefault(split, {})[cameras] = means
         return result
 
@@ -134,6 +211,20 @@ class MetricsAccumulator:
         """Write the means as `metrics.json`, whole or not at all."""
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(self.means(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+    def picture_rows(self) -> list[dict[str, Any]]:
+        """What `save_pictures` writes and `load_pictures` reads, without rounding."""
+        return [dict(zip(PICTURE_COLUMNS, key, strict=True)) | values for key, values in self._pictures.items()]
+
+    def save_pictures(self, path: Path | str) -> None:
+        """Write a CSV with a row for every picture that was added with its camera and frame; what a picture lacks is empty."""
+        names = list(dict.fromkeys(name for values in self._pictures.values() for name in values))
+        with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, [*PICTURE_COLUMNS, *names], lineterminator="\n")
+            writer.writeheader()
+            for key, values in self._pictures.items():
+                cells = {name: f"{value:.6g}" for name, value in values.items()}
+                writer.writerow(dict(zip(PICTURE_COLUMNS, key, strict=True)) | cells)
 
 
 def load_metrics(path: Path | str) -> dict[str, Any]:
@@ -152,6 +243,34 @@ def load_metrics(path: Path | str) -> dict[str, Any]:
         return json.loads(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
         raise ValueError(f"load_metrics(): expected JSON in {path}; got {error}. Evaluate the run again.") from error
+
+
+def load_pictures(path: Path | str) -> list[dict[str, Any]]:
+    """Read what `MetricsAccumulator.save_pictures` wrote: a dictionary a picture, numbers as floats, `frame` as int, gaps left out.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is not of that kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"load_pictures(): expected {path}; there is none. Run `python -m mitsuba_avatar.evaluate {path.parent}`.")
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        if tuple(reader.fieldnames or ())[: len(PICTURE_COLUMNS)] != PICTURE_COLUMNS:
+            raise ValueError(
+                f"load_pictures(): expected columns {PICTURE_COLUMNS} first in {path}; got {reader.fieldnames}. Evaluate again."
+            )
+        rows = []
+        for row in reader:
+            try:
+                numbers = {name: float(value) for name, value in row.items() if name not in PICTURE_COLUMNS and value}
+                rows.append({name: row[name] for name in PICTURE_COLUMNS} | {"frame": int(row["frame"])} | numbers)
+            except (TypeError, ValueError) as error:
+                raise ValueError(
+                    f"load_pictures(): expected numbers in line {reader.line_num} of {path}; got {error}. Evaluate again."
+                ) from error
+    return rows
 
 
 def read_records(path: Path | str) -> list[dict[str, Any]]:
@@ -176,17 +295,6 @@ def _difference(caller: str, image: np.ndarray, reference: np.ndarray) -> np.nda
     if image.shape != reference.shape:
         raise ValueError(f"{caller}(): expected images of one size; got {image.shape} and {reference.shape}. Render at the capture's size.")
     return image.astype(np.float64) - reference
-
-
-def _mean_in_mask(values: np.ndarray, mask: np.ndarray, caller: str) -> float:
-    if values.shape != mask.shape:
-        raise ValueError(f"{caller}(): expected a mask of {values.shape}; got {mask.shape}. Resize image and mask together.")
-    weight = mask.sum(dtype=np.float64)
-    if weight <= 0:
-        raise ValueError(
-            f"{caller}(): expected a mask that covers something; got an empty one. Leave this picture out: the camera sees nobody."
-        )
-    return float((values * mask).sum() / weight)
 
 
 def _window_mean(channels: np.ndarray) -> np.ndarray:

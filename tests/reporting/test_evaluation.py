@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from mitsuba_avatar.captures.colour import encode
-from mitsuba_avatar.reporting.evaluation import METHODS, as_images
-from mitsuba_avatar.reporting.metrics import image_metrics, silhouette_iou
+from mitsuba_avatar.reporting.evaluation import EVERY_MEASURE, METHODS, as_images
+from mitsuba_avatar.reporting.metrics import image_metrics, load_pictures, silhouette_iou, temporal_flicker
+from mitsuba_avatar.reporting.seams import SeamSampler
 from tests.drawn_capture import BACKGROUND, HEIGHT, HELD_OUT, TRAIN_FRAMES, WIDTH
 
 VIEWS = ["left", HELD_OUT, "front"]
@@ -87,3 +88,32 @@ def test_cameras_that_see_nobody_are_left_out(evaluator, monkeypatch):
 
 def test_frames_of_a_split_are_spread_evenly(evaluator):
     assert evaluator.split_frames(3) == {"train": [0, 4, 7], "test": [8, 9]}
+
+
+def test_every_measure_has_its_name_and_the_pictures_add_up(evaluator, tmp_path):
+    metrics = evaluator.measure({"test": [8, 9]}, ["avatar", "nearest_frame"], VIEWS, measures=EVERY_MEASURE)
+    means = metrics.means()
+    names = {f"{protocol}{name}" for protocol in ("", "image_", "box_") for name in ("psnr", "ssim", "l1", "mse", "flip")}
+    assert set(means["avatar"]["test"]["seen"]) == names | {"iou", "vertex_mm", "seam", "images"}
+    assert set(means["nearest_frame"]["test"]["seen"]) == names | {"iou", "vertex_mm", "images"}
+    batch = evaluator.reader.read([8], [VIEWS])
+    metrics.save_pictures(tmp_path / "metrics.csv")
+    rows = [row for row in load_pictures(tmp_path / "metrics.csv") if row["method"] == "avatar" and row["camera"] != HELD_OUT]
+    assert [(row["camera"], row["frame"]) for row in rows] == [("left", 28), ("front", 28), ("left", 29), ("front", 29)]
+    assert np.mean([row["box_flip"] for row in rows]) == pytest.approx(means["avatar"]["test"]["seen"]["box_flip"], rel=1e-4)
+    texture = evaluator.draw("avatar", batch).texture
+    assert rows[0]["seam"] == pytest.approx(SeamSampler(evaluator.renderer.topology).difference(texture), rel=1e-4)
+
+
+def test_flicker_compares_neighbours_of_one_segment(evaluator):
+    """Frame 8 looks forwards, frame 9 is the segment's last and looks back: both are the same pair."""
+    metrics = evaluator.measure_flicker({"test": [8, 9], "train": [2]}, ["avatar", "nearest_frame"], ["left"])
+    means = metrics.means()["avatar"]
+    pictures, references, masks = [], [], []
+    for index in (8, 9):
+        batch = evaluator.reader.read([index], [["left"]])
+        pictures.append(as_images(evaluator.draw("avatar", batch).images)[0])
+        references.append(as_images(batch.images)[0])
+        masks.append(batch.masks[0, 0].numpy())
+    assert means["test"]["seen"]["flicker"] == pytest.approx(temporal_flicker(*map(np.stack, (pictures, references, masks))), rel=1e-5)
+    assert means["test"]["seen"]["images"] == 2 and means["train"]["seen"]["images"] == 1

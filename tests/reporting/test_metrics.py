@@ -11,6 +11,7 @@ from mitsuba_avatar.reporting.metrics import (
     image_metrics,
     l1_in_mask,
     load_metrics,
+    load_pictures,
     mse_in_mask,
     psnr_from_mse,
     read_records,
@@ -140,3 +141,33 @@ def test_a_log_cut_short_is_read_up_to_its_last_whole_line(tmp_path):
     path.write_text('{"iterat\n{"iteration": 2}\n')
     with pytest.raises(ValueError, match="expected JSON in line 1"):
         read_records(path)
+
+
+def test_every_picture_is_kept_with_its_camera_and_frame(tmp_path):
+    metrics = MetricsAccumulator()
+    metrics.add("avatar", "test", "seen", {"psnr": 20.5, "l1": 4.0}, ("north", 7))
+    metrics.add("avatar", "test", "seen", {"psnr": 22.5, "l1": 3.0})
+    flicker = MetricsAccumulator()
+    flicker.add("avatar", "test", "seen", {"flicker": 1.25}, ("north", 7))
+    flicker.add("avatar", "test", "seen", {"flicker": 1.75}, ("south, low", 8))
+    metrics.absorb(flicker)
+    metrics.save_pictures(tmp_path / "metrics.csv")
+    assert load_pictures(tmp_path / "metrics.csv") == [
+        {"method": "avatar", "split": "test", "cameras": "seen", "camera": "north", "frame": 7, "psnr": 20.5, "l1": 4.0, "flicker": 1.25},
+        {"method": "avatar", "split": "test", "cameras": "seen", "camera": "south, low", "frame": 8, "flicker": 1.75},
+    ]
+    assert metrics.means()["avatar"]["test"]["seen"] == {"psnr": 21.5, "l1": 3.5, "flicker": 1.5, "images": 2}
+    with pytest.raises(ValueError, match=r"got \['flicker'\] again"):
+        metrics.absorb(flicker)
+
+
+def test_a_damaged_list_of_pictures_names_the_line(tmp_path):
+    path = tmp_path / "metrics.csv"
+    with pytest.raises(FileNotFoundError, match=r"Run `python -m mitsuba_avatar\.evaluate"):
+        load_pictures(path)
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match="expected columns"):
+        load_pictures(path)
+    path.write_text("method,split,cameras,camera,frame,psnr\navatar,test,seen,north,7,oops\n")
+    with pytest.raises(ValueError, match="expected numbers in line 2"):
+        load_pictures(path)

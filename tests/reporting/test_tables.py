@@ -1,6 +1,9 @@
 """Tables: every value lands in its cell, columns are aligned, gaps are dashes."""
 
-from mitsuba_avatar.reporting.tables import markdown_table, metric_rows, terminal_table
+import csv
+import io
+
+from mitsuba_avatar.reporting.tables import csv_table, latex_table, markdown_table, metric_rows, terminal_table
 
 METRICS = {
     "avatar": {
@@ -37,3 +40,32 @@ def test_markdown_has_one_row_for_each():
 
 def test_an_empty_file_is_an_empty_table():
     assert terminal_table({}).splitlines()[0] == "split  cameras  method"
+
+
+PROTOCOLS = {
+    "ours_full": {"test": {"seen": {"psnr": 30.0, "box_psnr": 25.006, "box_l1": 3.0, "vertex_mm": 2.5, "images": 3}}},
+    "nearest_frame": {"test": {"seen": {"psnr": 28.0, "box_psnr": 25.11, "box_l1": 4.0, "images": 3}}},
+}
+
+
+def test_a_protocol_shows_its_own_columns_and_those_of_none():
+    headings, rows = metric_rows(PROTOCOLS, "box")
+    assert headings[3:] == ["PSNR (dB) ↑", "L1 (0..255) ↓", "vertices (mm) ↓", "images"]
+    assert rows[0][3:] == ["25.01", "3.00", "2.50", "3"]
+    assert metric_rows(PROTOCOLS, "mask")[0][3:] == ["PSNR (dB) ↑", "vertices (mm) ↓", "images"]
+    assert "box PSNR (dB) ↑" in metric_rows(PROTOCOLS)[0]
+
+
+def test_latex_has_booktabs_rules_escaped_names_and_bold_winners():
+    text = latex_table(PROTOCOLS, "box", caption="50 % of R&D", label="tab:box")
+    assert text.index("toprule") < text.index("midrule") < text.index("bottomrule")
+    ours, nearest = (next(line for line in text.splitlines() if name in line) for name in ("ours", "nearest"))
+    assert ours.strip() == r"test & seen & ours\_full & 25.01 & \textbf{3.00} & 2.50 \\"
+    assert nearest.strip() == r" &  & nearest\_frame & \textbf{25.11} & 4.00 & -- \\".strip()
+    assert r"\caption{50 \% of R\&D}" in text and r"\label{tab:box}" in text
+    assert all(line.count("&") == 5 for line in text.splitlines() if "&" in line and "caption" not in line)
+
+
+def test_csv_keeps_full_precision_and_gaps():
+    rows = list(csv.DictReader(io.StringIO(csv_table(PROTOCOLS))))
+    assert float(rows[0]["box_psnr"]) == 25.006 and rows[1]["vertex_mm"] == "" and rows[1]["method"] == "nearest_frame"
