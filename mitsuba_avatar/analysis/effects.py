@@ -23,6 +23,7 @@ from mitsuba_avatar.training.statistics import evenly_spaced
 
 FACE = "face"
 DEVIATIONS = 2.0  # of the training frames, that a control is moved by
+FEWEST_VERTICES = 0.02  # share of all vertices that a control must govern to be worth a picture
 FRAMES = 16  # of training, that effects are averaged over
 
 
@@ -48,8 +49,9 @@ class Effect:
 
 
 def liveliest_controls(study: Study, count: int = 5) -> list[str]:
-    """The face, and the pose angles that vary most over the training frames, one for each joint."""
+    """The pose angles that vary most over the training frames, one for each joint that governs a good part of the surface, and the face."""
     std = study.drive.theta[study.frames("train")].std(0).numpy()
+    std = np.where(driving_regions(study.rig).theta.mean(1) >= FEWEST_VERTICES, std, -1.0)  # fingers would crowd out limbs
     chosen: dict[int, int] = {}
     for angle in np.argsort(-std, kind="stable"):
         chosen.setdefault(int(study.rig.dofs.joints[angle]), int(angle))
