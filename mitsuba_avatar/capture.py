@@ -8,12 +8,11 @@ another data set's files, or a Goliath body capture from a capture.
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import torch
 import tyro
 from jaxtyping import Float
 from rich.console import Console
@@ -21,8 +20,7 @@ from rich.filesize import decimal
 from rich.table import Table
 
 from mitsuba_avatar.body.rig import Rig, load_rig
-from mitsuba_avatar.body.skeleton import Skeleton
-from mitsuba_avatar.body.skinning import pose_vertices
+from mitsuba_avatar.body.skinning import posed_rest_surface
 from mitsuba_avatar.captures.arrays import FRAME_ARRAYS
 from mitsuba_avatar.captures.checks import check_arrays, check_images
 from mitsuba_avatar.captures.colour import encode_bytes
@@ -31,7 +29,7 @@ from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.captures.reprojection import Diagnosis, Observation, diagnose
 from mitsuba_avatar.captures.rigid import inverse_rigid
 from mitsuba_avatar.converting import ConvertCommand, run_conversion
-from mitsuba_avatar.progress import progress_bar
+from mitsuba_avatar.progress import tracked
 from mitsuba_avatar.rendering.backend import BackendError
 
 SHEET_CAMERAS = 8  # columns of the contact sheet; more are not readable
@@ -81,7 +79,7 @@ def check(path: CapturePath, frames: int = 3, out: Path = Path("capture_check"),
     capture = Capture.open(path, image_scale=min(1.0, size / longest))
     rig = _rig_of(capture)
     check_arrays(capture, rig)
-    check_images(capture, _bar(range(len(capture.frames)), "Checking images and masks"))
+    check_images(capture, tracked(range(len(capture.frames)), "Checking images and masks"))
     indices = np.linspace(0, len(capture.frames) - 1, min(frames, len(capture.frames))).round().astype(int).tolist()
     meshes = {index: _mesh(capture, rig, index) for index in indices}
     has_masks = (capture.path / "masks").is_dir()
@@ -99,13 +97,6 @@ def check(path: CapturePath, frames: int = 3, out: Path = Path("capture_check"),
         console.print("The capture is fine: values, files, and the mesh projects onto the masks.", highlight=False)
     else:
         raise ValueError(_complaint(capture, diagnosis, minimum_iou))
-
-
-def posed_mesh(rig: Rig, theta: Float[np.ndarray, "D"], root: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "V 3"]:
-    """Vertices [V, 3] of the rig's rest surface in one pose: theta [D] radians, root [4, 4]."""
-    with torch.no_grad():
-        transforms = Skeleton(rig)(torch.from_numpy(np.array(theta)[None]), torch.from_numpy(np.array(root)[None]))
-        return pose_vertices(torch.from_numpy(rig.rest_vertices)[None], transforms, torch.from_numpy(rig.skinning_weights))[0].numpy()
 
 
 def _rig_of(capture: Capture) -> Rig:
@@ -127,7 +118,7 @@ def _mesh(capture: Capture, rig: Rig, index: int) -> PosedMesh:
     """Vertices [V, 3] of a frame, and the root by which they were posed (None if registered)."""
     if capture.vertices is not None:
         return np.array(capture.vertices[index]), None
-    return posed_mesh(rig, capture.theta[index], capture.root[index]), np.array(capture.root[index])
+    return posed_rest_surface(rig, capture.theta[index], capture.root[index]), np.array(capture.root[index])
 
 
 def _diagnosis(capture: Capture, rig: Rig, meshes: dict[int, PosedMesh], minimum_iou: float) -> Diagnosis:
@@ -137,7 +128,7 @@ def _diagnosis(capture: Capture, rig: Rig, meshes: dict[int, PosedMesh], minimum
         for index, (vertices, root) in meshes.items()
         for name, camera in capture.cameras.items()
     ]
-    return diagnose(observations, rig.topology.faces, minimum_iou, pixel=capture.image_scale, track=_bar)
+    return diagnose(observations, rig.topology.faces, minimum_iou, pixel=capture.image_scale, track=tracked)
 
 
 def _require_pose_agreement(capture: Capture, rig: Rig, indices: Sequence[int]) -> None:
@@ -146,9 +137,9 @@ def _require_pose_agreement(capture: Capture, rig: Rig, indices: Sequence[int]) 
         return
     for index in indices:
         registered, theta, root = np.array(capture.vertices[index]), capture.theta[index], np.array(capture.root[index])
-        distance = _mean_distance(registered, posed_mesh(rig, theta, root))
+        distance = _mean_distance(registered, posed_rest_surface(rig, theta, root))
         if distance > FARTHEST_SURFACE:
-            with_inverse = _mean_distance(registered, posed_mesh(rig, theta, inverse_rigid(root)))
+            with_inverse = _mean_distance(registered, posed_rest_surface(rig, theta, inverse_rigid(root)))
             trap = (
                 "The likely trap: inverted root pose. Invert root.npy: it holds world_from_root."
                 if with_inverse < 0.5 * distance
@@ -185,7 +176,7 @@ def _draw_sheet(path: Path, capture: Capture, rig: Rig, meshes: dict[int, PosedM
     low_cameras = diagnosis.low_cameras if diagnosis is not None else ()
     chosen = sorted(capture.cameras, key=lambda name: name not in low_cameras)[:SHEET_CAMERAS]
     rows = []
-    for index, (vertices, _) in _bar(list(meshes.items()), "Drawing the contact sheet"):
+    for index, (vertices, _) in tracked(list(meshes.items()), "Drawing the contact sheet"):
         row = []
         for name in chosen:
             mask = capture.mask(name, index) > 0.5 if diagnosis is not None else None
@@ -194,14 +185,6 @@ def _draw_sheet(path: Path, capture: Capture, rig: Rig, meshes: dict[int, PosedM
             row.append(Tile(pixels, caption, is_suspicious=name in low_cameras))
         rows.append(row)
     save_contact_sheet(path, rows, f"{capture.description.name}: does the mesh project onto the masks?")
-
-
-def _bar(items: Sequence, description: str) -> Iterator:
-    """The items one by one, with a progress bar."""
-    with progress_bar(description, len(items)) as bar:
-        for done, item in enumerate(items, start=1):
-            yield item
-            bar.update(done)
 
 
 def _agreement_table(diagnosis: Diagnosis) -> Table:

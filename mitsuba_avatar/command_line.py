@@ -6,6 +6,7 @@ Flags are the fields of a small dataclass, read by tyro; every other word is an 
 """
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -43,6 +44,18 @@ def parse_command(command: type[CommandType], settings: type, arguments: Sequenc
             )
         is_value = not is_value and "=" not in word
     return flags, words
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """Index and count of a shard "i/n"; empty text is the whole, shard 0 of 1.
+
+    Raises:
+        ValueError: not of the form i/n with 0 <= i < n.
+    """
+    match = re.fullmatch(r"(\d+)/(\d+)", text or "0/1")
+    if match is None or int(match[1]) >= int(match[2]):
+        raise ValueError(f"parse_shard(): expected --shard i/n with 0 <= i < n, like 0/4; got {text!r}. Count shards from 0.")
+    return int(match[1]), int(match[2])
 
 
 def _describe(settings: type) -> str:

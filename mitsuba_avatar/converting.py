@@ -4,7 +4,7 @@ The readers know files, the body stage knows rigs; here they meet.
 """
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +18,7 @@ from rich.console import Console
 
 from mitsuba_avatar.body.momentum_rig import face_signal, momentum_from_rig, momentum_poses, rig_from_momentum
 from mitsuba_avatar.body.rig import Rig, load_rig, save_rig
+from mitsuba_avatar.body.skinning import posed_rest_surface
 from mitsuba_avatar.captures.arrays import open_frame_array
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.captures.formats.conversion import ConversionOptions, convert, read_report, with_frames
@@ -27,7 +28,7 @@ from mitsuba_avatar.captures.formats.opening import FormatName, open_source
 from mitsuba_avatar.captures.formats.source import Source, SourceOptions, UpAxis
 from mitsuba_avatar.captures.images import ImageExtension
 from mitsuba_avatar.captures.writer import CaptureWriter
-from mitsuba_avatar.progress import progress_bar
+from mitsuba_avatar.progress import tracked
 from mitsuba_avatar.rendering.backend import select_variant
 
 OCCLUSION_RAYS = 32  # per texel
@@ -104,9 +105,9 @@ def _import(command: ConvertCommand) -> None:
         command.scale, command.held_out_cameras, command.image_extension, command.every, body is not None, command.links
     )
     capture = (
-        convert(source, command.destination, conversion, track=track)
+        convert(source, command.destination, conversion, track=tracked)
         if body is None
-        else convert(source, command.destination, conversion, body.add, track)
+        else convert(source, command.destination, conversion, body.add, tracked)
     )
     _print_summary(capture, source)
 
@@ -147,7 +148,7 @@ def _export(command: ConvertCommand) -> None:
         rig = load_rig(capture.rig_path)
         occlusion = _occlusion(capture, rig, command.occlusion_size) if command.occlusion_size else None
         body = GoliathBody(momentum_from_rig(rig), momentum_poses(np.array(capture.theta), np.array(capture.root)), occlusion)
-    path = write_goliath(capture, command.destination, body, track)
+    path = write_goliath(capture, command.destination, body, tracked)
     console = Console()
     console.print(f"Wrote {len(capture.cameras)} cameras and {len(capture.frames)} frames to {path}.", highlight=False, soft_wrap=True)
     if body is None:
@@ -160,30 +161,19 @@ def _occlusion(capture: Capture, rig: Rig, size: int) -> Callable[[int], Float32
     loaded = sys.modules.get("mitsuba")
     if loaded is None or loaded.variant() is None:
         select_variant("auto")
-    from mitsuba_avatar.body.skeleton import Skeleton
-    from mitsuba_avatar.body.skinning import pose_vertices
     from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
 
-    tracer, skeleton = AmbientOcclusion(rig.topology, size, OCCLUSION_RAYS, OCCLUSION_METRES), Skeleton(rig)
+    tracer = AmbientOcclusion(rig.topology, size, OCCLUSION_RAYS, OCCLUSION_METRES)
 
     def occlusion(index: int) -> Float32[np.ndarray, "S S"]:
+        if capture.vertices is not None:
+            vertices = np.array(capture.vertices[index])
+        else:
+            vertices = posed_rest_surface(rig, capture.theta[index], capture.root[index])
         with torch.no_grad():
-            if capture.vertices is not None:
-                vertices = torch.from_numpy(np.array(capture.vertices[index]))
-            else:
-                transforms = skeleton(torch.from_numpy(np.array(capture.theta[[index]])), torch.from_numpy(np.array(capture.root[[index]])))
-                vertices = pose_vertices(torch.from_numpy(rig.rest_vertices)[None], transforms, torch.from_numpy(rig.skinning_weights))[0]
-            return tracer.bake(vertices).cpu().numpy()
+            return tracer.bake(torch.from_numpy(vertices)).cpu().numpy()
 
     return occlusion
-
-
-def track(items: Sequence, description: str) -> Iterator:
-    """The items one by one, with a progress bar."""
-    with progress_bar(description, len(items)) as bar:
-        for done, item in enumerate(items, start=1):
-            yield item
-            bar.update(done)
 
 
 def _print_summary(capture: Capture, source: Source) -> None:

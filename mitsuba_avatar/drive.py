@@ -207,7 +207,7 @@ def _draw(
     folder: Path,
 ) -> "FrameClock":
     """Decode, render, write."""
-    from mitsuba_avatar.captures.folder import Capture
+    from mitsuba_avatar.captures.folder import DESCRIPTION_FILE, Capture
     from mitsuba_avatar.driving.animation import FrameClock, animate, outline
     from mitsuba_avatar.loaded_run import avatar_occlusion
     from mitsuba_avatar.progress import progress_bar
@@ -215,9 +215,13 @@ def _draw(
     from mitsuba_avatar.reporting.figures import Tile, compose, save_image
     from mitsuba_avatar.reporting.video import write_video
     from mitsuba_avatar.reporting.view_transform import ViewTransform, write_png
+    from mitsuba_avatar.training.readiness import open_as_set
 
     count, transform, clock = len(signals), ViewTransform(), FrameClock()
-    capture = Capture.open(command.pose or run.capture_path) if command.path == "held_out" else None
+    capture = None
+    if command.path == "held_out":  # of what drives, or of the run's capture where that has no cameras
+        has_cameras = bool(command.pose) and (Path(command.pose) / DESCRIPTION_FILE).is_file()
+        capture = Capture.open(command.pose) if has_cameras else open_as_set(run.capture_path, run.settings.capture)
     cameras, turns = _cameras(command, capture, outline(avatar, signals), count)
     signals = signals.turned(turns)
     samples = command.samples or run.settings.evaluation.samples_per_pixel

@@ -89,9 +89,8 @@ def _write_textures(command: ExportCommand, loaded: "LoadedRun", folder: Path) -
     from mitsuba_avatar.reporting.playback import Playback
     from mitsuba_avatar.reporting.relighting import CapturedLight, SurfaceRadiance, estimate_albedo
     from mitsuba_avatar.reporting.view_transform import ViewTransform, write_png
-    from mitsuba_avatar.training.readiness import open_as_set
 
-    trained = open_as_set(loaded.run.capture_path, loaded.run.settings.capture) if command.capture else loaded.capture
+    trained = loaded.trained_capture()
     shown = SurfaceRadiance(Playback(loaded.avatar, trained, loaded.occlusion()), loaded.run.rig.topology)
     maps = {"radiance": shown.mean()} if command.texture == "radiance" or "textures" in command.format else {}
     if command.texture == "albedo" or "textures" in command.format:
@@ -142,7 +141,8 @@ def _write_sequences(
 
     topology = loaded.run.rig.topology
     if "usd" in command.format:
-        write_usd(folder / "avatar.usdc", motion.vertices, topology, motion.fps, f"textures/{command.texture}.png")
+        picture, is_lit = f"textures/{command.texture}.png", command.texture == "albedo"
+        write_usd(folder / "avatar.usdc", motion.vertices, topology, motion.fps, picture, is_lit)
     obj = ObjSequence(folder / "obj", topology, texture) if "obj" in command.format and texture is not None else None
     if obj is None and "ply" not in command.format:
         return

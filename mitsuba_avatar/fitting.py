@@ -17,6 +17,8 @@ import torch
 from mitsuba_avatar.body.rig import Rig, load_rig
 from mitsuba_avatar.captures.checks import check_values
 from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.driving.animation import FrameClock, animate, outline
+from mitsuba_avatar.driving.signals import DrivingSignals
 from mitsuba_avatar.filming.film import default_capture_path, film_capture
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.model.avatar import Avatar
@@ -28,9 +30,10 @@ from mitsuba_avatar.reporting.camera_paths import orbit
 from mitsuba_avatar.reporting.evaluation import Evaluator
 from mitsuba_avatar.reporting.figures import loss_curves, save_image
 from mitsuba_avatar.reporting.metrics import read_records
-from mitsuba_avatar.reporting.presentation import Presentation, Shot, draw_along, posed_corners
+from mitsuba_avatar.reporting.presentation import Presentation, Shot
 from mitsuba_avatar.reporting.tables import terminal_table
 from mitsuba_avatar.reporting.video import write_video
+from mitsuba_avatar.reporting.view_transform import ViewTransform
 from mitsuba_avatar.settings import Settings
 from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.distributed import Process, join_processes, leave_processes
@@ -213,18 +216,22 @@ class Fit:
         evaluation, capture = self.settings.evaluation, self.capture
         split = capture.frame_indices(capture.frames[frames[0]].split)
         along = [split[i * len(split) // evaluation.orbit_frames] for i in range(evaluation.orbit_frames)]
-        corners = posed_corners(self.avatar, capture, along)
+        rows = sorted(set(along))
+        signals = DrivingSignals.of_capture(capture, rows)
+        corners = outline(self.avatar, signals, most_frames=len(rows))
         cameras = orbit(corners, evaluation.orbit_frames, evaluation.orbit_width, evaluation.orbit_height)
+        shots = [(rows.index(frame), camera) for frame, camera in zip(along, cameras, strict=True)]
+        latents = torch.zeros(len(rows), self.settings.model.latent_size if self.settings.model.use_latent else 0)
         renderer = SurfaceRenderer(
             self.run.rig.topology, evaluation.orbit_width, evaluation.orbit_height, samples_per_pixel=evaluation.samples_per_pixel
         )
         with progress_bar("orbit", evaluation.orbit_frames) as bar:
-            drawn = draw_along(self.avatar, capture, along, cameras, renderer, self.occlusion.occlusion)
+            drawn = animate(self.avatar, signals, latents, shots, renderer, self.occlusion.occlusion, FrameClock())
 
             def pictures() -> Iterator:
-                for done, picture in enumerate(drawn):
+                for done, frame in enumerate(drawn):
                     bar.update(done + 1)
-                    yield picture.on_backdrop()
+                    yield ViewTransform().apply(frame.radiance, frame.coverage)
 
             write_video(self.run.path / "orbit.mp4", pictures(), fps=12.0)
 

@@ -46,6 +46,16 @@ class LoadedRun:
         check_arrays(capture, rig)
         return LoadedRun(run, run.load_avatar(checkpoint), capture)
 
+    def trained_capture(self) -> Capture:
+        """The capture that the avatar learnt from, which is not always the one that drives it.
+
+        Raises:
+            FileNotFoundError, ValueError: it is gone, or cannot be used.
+        """
+        if self.capture.path.resolve() == self.run.capture_path.resolve():
+            return self.capture
+        return open_as_set(self.run.capture_path, self.run.settings.capture)
+
     def occlusion(self) -> AmbientOcclusion:
         """Baker of occlusion maps at the size that the avatar reads."""
         return avatar_occlusion(self.run)

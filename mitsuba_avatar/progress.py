@@ -1,13 +1,15 @@
 """Progress of long steps: a live bar with rate and time left on a terminal, a line every few seconds in a log file."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
+Item = TypeVar("Item")
 LOG_INTERVAL = 10.0  # seconds between lines where there is no terminal
 
 
@@ -58,6 +60,14 @@ def progress_bar(description: str, total: int, initial: int = 0, is_shown: bool 
     ]
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         yield ProgressBar(console, progress, description, total, initial)
+
+
+def tracked(items: Sequence[Item], description: str) -> Iterator[Item]:
+    """The items one by one, with a progress bar."""
+    with progress_bar(description, len(items)) as bar:
+        for done, item in enumerate(items, start=1):
+            yield item
+            bar.update(done)
 
 
 class StageProgress:

@@ -79,7 +79,7 @@ def _reconstruct(command: ReconstructCommand) -> int:
     out = Path(command.out) if command.out else loaded.run.path / "reconstructions" / f"{command.split}_{command.start}"
     facts = {"capture": str(loaded.capture.path.resolve()), "checkpoint": command.checkpoint, "start": command.start}
     index = loaded.run.checkpoints.index()
-    facts |= {"iteration": None if index is None else vars(index)[command.checkpoint], "every": command.every, "first": frames[0]}
+    facts |= {"iteration": None if index is None else index.iteration_of(command.checkpoint), "every": command.every, "first": frames[0]}
     folder = ReconstructionFolder(out, facts | dataclasses.asdict(settings))
     reader, rendering = _reader(loaded), loaded.run.settings.rendering
     renderer = SurfaceRenderer(

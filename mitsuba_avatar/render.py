@@ -126,9 +126,10 @@ def _views(command: RenderCommand, loaded: "LoadedRun") -> list["NovelView"]:
     import numpy as np
 
     from mitsuba_avatar.captures.cameras import load_cameras
+    from mitsuba_avatar.driving.animation import outline
+    from mitsuba_avatar.driving.signals import DrivingSignals
     from mitsuba_avatar.reporting import camera_paths
     from mitsuba_avatar.reporting.novel_views import NovelView
-    from mitsuba_avatar.reporting.presentation import posed_corners
 
     capture, frames = loaded.capture, _frames(command, loaded)
     size, turns = (command.frames, command.width, command.height), np.tile(np.eye(4), (command.frames, 1, 1))
@@ -149,7 +150,7 @@ def _views(command: RenderCommand, loaded: "LoadedRun") -> list["NovelView"]:
     elif command.path == "keyframes":
         cameras = camera_paths.key_framed(command.file, *size)
     else:
-        corners = posed_corners(loaded.avatar, capture, frames)
+        corners = outline(loaded.avatar, DrivingSignals.of_capture(capture, sorted(set(frames))), most_frames=command.frames)
         if command.path == "turntable":
             cameras, turns = camera_paths.turntable(corners, *size)
         else:
@@ -187,7 +188,7 @@ def _painter(command: RenderCommand, loaded: "LoadedRun", first: "NovelView", fo
     from mitsuba_avatar.rendering.path_tracing import PathTracer, SampleBudget
     from mitsuba_avatar.reporting.novel_views import ViewPainter
     from mitsuba_avatar.reporting.playback import Playback
-    from mitsuba_avatar.reporting.relighting import SurfaceRadiance, estimate_albedo, scene_file
+    from mitsuba_avatar.reporting.relighting import CapturedLight, SurfaceRadiance, estimate_albedo, scene_file
 
     topology, tracer = loaded.run.rig.topology, None
     budget = SampleBudget(command.samples, command.noise)
@@ -196,25 +197,14 @@ def _painter(command: RenderCommand, loaded: "LoadedRun", first: "NovelView", fo
         tracer = PathTracer(lit, command.max_depth)
     albedo = None
     if has_albedo:
-        trained, light = _trained_on(command, loaded)
+        trained = loaded.trained_capture()
         shown = SurfaceRadiance(Playback(loaded.avatar, trained, loaded.occlusion()), topology)
         with progress_bar("albedo", len(shown.frames)) as bar:
-            albedo = estimate_albedo(shown, light, bar.update)
+            albedo = estimate_albedo(shown, CapturedLight.of(trained, command.captured_light), bar.update)
     playback = Playback(loaded.avatar, loaded.capture, loaded.occlusion())
     painter = ViewPainter(playback, loaded.renderer(first.camera.width, first.camera.height), albedo, tracer, budget)
     settled = folder.settle(lambda: {"samples": painter.samples_within(command.seconds, first)} if command.seconds else {})
     return replace(painter, budget=SampleBudget(settled["samples"])) if command.seconds else painter
-
-
-def _trained_on(command: RenderCommand, loaded: "LoadedRun") -> tuple[Any, Any]:
-    """The capture that the avatar learnt from, where it is still there, and its light."""
-    from mitsuba_avatar.reporting.relighting import CapturedLight
-    from mitsuba_avatar.training.readiness import open_as_set
-
-    if not command.capture:
-        return loaded.capture, CapturedLight.of(loaded.capture, command.captured_light)
-    trained = open_as_set(loaded.run.capture_path, loaded.run.settings.capture)
-    return trained, CapturedLight.of(trained, command.captured_light)
 
 
 def _write(path: Path, drawn: "DrawnView", transform: "ViewTransform", loaded: "LoadedRun") -> None:

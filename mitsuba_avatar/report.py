@@ -65,7 +65,7 @@ def _report(command: ReportCommand) -> Path:
 
 
 def _reported(path: Path, name: str, command: ReportCommand) -> "ReportedRun":
-    """A run with its measurements: those on disk, or new ones, which are kept where the run has none of its own."""
+    """A run with its measurements: those on disk, or new ones, which leave the run folder as it is."""
     from mitsuba_avatar.loaded_run import LoadedRun
     from mitsuba_avatar.progress import progress_bar
     from mitsuba_avatar.reporting.evaluation import EVERY_MEASURE

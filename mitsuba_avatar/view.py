@@ -82,6 +82,7 @@ def open_material(loaded: "LoadedRun", motion: str = "", checkpoint: str = "last
     Args:
         loaded: the run.
         motion: what the timeline plays, see `driving.sources`; empty for the capture's test split, or all frames where it has none.
+            Another capture's face is played too; a motion without a face keeps the mean of the training frames.
         checkpoint: that `loaded` was opened with.
 
     Raises:
@@ -93,7 +94,6 @@ def open_material(loaded: "LoadedRun", motion: str = "", checkpoint: str = "last
     from mitsuba_avatar.driving.signals import DrivingSignals
     from mitsuba_avatar.driving.sources import load_body
     from mitsuba_avatar.driving.training_latents import training_latents
-    from mitsuba_avatar.training.readiness import open_as_set
     from mitsuba_avatar.viewing.session import MOST_NAMED_FACE_ENTRIES, Material
 
     run, capture = loaded.run, loaded.capture
@@ -103,13 +103,16 @@ def open_material(loaded: "LoadedRun", motion: str = "", checkpoint: str = "last
     latents = None
     if run.settings.model.use_latent:
         try:
-            latents = training_latents(run, loaded.avatar, lambda: open_as_set(run.capture_path, run.settings.capture), checkpoint)
+            latents = training_latents(run, loaded.avatar, loaded.trained_capture, checkpoint)
         except FileNotFoundError as error:  # without meshes there is nothing to encode: z is drawn or zero
             sys.stderr.write(f"view: no latent codes of training frames ({error})\n")
     timeline = next(iter(others.values()), training)
     if motion:
         track = load_body(motion, run.rig)
         face = training.face.mean(0).expand(len(track.theta), -1).clone()
+        recorded = None if track.capture is None else track.capture.face
+        if recorded is not None and recorded.shape[1] == run.face_size:
+            face = torch.from_numpy(np.array(recorded[list(track.frames)], np.float32))
         theta, root = (torch.from_numpy(np.asarray(values, np.float32)) for values in (track.theta, track.root))
         timeline = DrivingSignals(theta, root, face, track.fps, track.clips)
         others["motion"] = timeline

@@ -47,6 +47,13 @@ def test_held_out_cameras_see_the_driven_person_where_the_capture_has_it(fitted_
         assert np.abs(picture - drawn_capture.display_image(name, index))[mask == 1].mean() < 0.06
 
 
+def test_what_has_no_cameras_is_seen_by_the_held_out_ones_of_the_run_s_capture(fitted_run, drawn_capture, private_cache, tmp_path):
+    np.save(tmp_path / "theta.npy", np.array(drawn_capture.theta[:1]))
+    words = ("--pose", str(tmp_path / "theta.npy"), "--path", "held_out", "--format", "png")
+    assert main(["--run", str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
+    assert read_image(tmp_path / "out/000000.png").shape == (HEIGHT, WIDTH, 3)
+
+
 def test_arrays_out_of_range_are_held_or_projected_and_reported(fitted_run, drawn_capture, private_cache, tmp_path, capsys):
     theta = np.array(drawn_capture.theta[:3])
     theta[1, 2] = 2.2 + 0.5  # the elbow bends no farther than 2.2

@@ -41,6 +41,14 @@ def test_a_recorded_motion_becomes_the_timeline(run, tmp_path):
     assert list(material.others) == ["test", "motion"] and len(material.timeline.face) == 3
 
 
+def test_a_capture_as_motion_brings_its_face(run, drawn_capture, tmp_path):
+    shutil.copytree(drawn_capture.path, tmp_path / "other")
+    face = np.array(drawn_capture.face) + np.float32(0.01)
+    np.save(tmp_path / "other/face.npy", face)
+    timeline = open_material(LoadedRun.open(run), str(tmp_path / "other")).timeline
+    np.testing.assert_array_equal(timeline.face, face[drawn_capture.frame_indices("test")])
+
+
 def test_a_capture_without_meshes_still_has_a_viewer(run, drawn_capture, tmp_path, capsys):
     copy = shutil.copytree(drawn_capture.path, tmp_path / "copy", ignore=shutil.ignore_patterns("vertices.npy"))
     facts = (run / "run.json").read_text().replace(str(drawn_capture.path), str(copy))

@@ -19,6 +19,7 @@ from torch import Tensor
 from mitsuba_avatar.analysis.measures import AT_ONCE, MILLIMETRES, Study
 from mitsuba_avatar.analysis.regions import with_surroundings
 from mitsuba_avatar.body.driving import driving_regions
+from mitsuba_avatar.driving.principal_directions import PrincipalDirections
 from mitsuba_avatar.training.statistics import evenly_spaced
 
 FACE = "face"
@@ -143,6 +144,5 @@ def _decoded(study: Study, theta: Tensor, face: Tensor) -> Float[Tensor, "N V 3"
 
 def _main_direction(face: Float[Tensor, "N F"]) -> Float[Tensor, "F"]:  # noqa: F821
     """First principal component, as long as the deviation along it."""
-    centred = face - face.mean(0)
-    _, singular, directions = torch.linalg.svd(centred, full_matrices=False)
-    return directions[0] * singular[0] / np.sqrt(max(len(face) - 1, 1))
+    steps = PrincipalDirections.of(face.numpy(), 1).steps  # none where the face does not move
+    return torch.from_numpy(steps.sum(axis=0)).to(face)

@@ -20,12 +20,13 @@ from mitsuba_avatar.body.mesh import vertex_normals
 from mitsuba_avatar.body.skinning import pose_vertices
 from mitsuba_avatar.body.uv import UvAtlas
 from mitsuba_avatar.captures.cameras import Camera
-from mitsuba_avatar.captures.colour import decode
+from mitsuba_avatar.captures.colour import decode, encode
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.reporting.camera_paths import orbit
+from mitsuba_avatar.reporting.figures import heat_map
 
 WIDTH, HEIGHT = 210, 330  # pixels of a tile
 TEXTURE = 256  # texels that fields are painted with
@@ -87,8 +88,7 @@ class FieldPainter:
             field = self.atlas.texels_from_vertices(field[None, :, None])[0, 0]
         else:
             field = torch.nn.functional.interpolate(field[None, None], size=(TEXTURE, TEXTURE), mode="bilinear", align_corners=False)[0, 0]
-        colour = matplotlib.colormaps[COLOURS]((field / most).clamp(0, 1).numpy())[..., :3].astype(np.float32)
-        colour = torch.from_numpy(decode(colour, "srgb")).permute(2, 0, 1)
+        colour = torch.from_numpy(decode(heat_map(field.numpy(), most, COLOURS), "srgb")).permute(2, 0, 1)
         cameras = _front_and_back(painted.vertices)
         batch = CameraBatch.from_cameras(cameras)
         normals = self.atlas.texels_from_vertices(vertex_normals(painted.vertices[None], torch.from_numpy(self.topology.faces)))[0]
@@ -99,7 +99,7 @@ class FieldPainter:
             textures.append(colour * (AMBIENT + (1 - AMBIENT) * (normals * towards[:, None, None]).sum(0).clamp(min=0)))
         white = torch.ones(3)
         image, _ = self.renderer.render(painted.vertices[None], torch.stack(textures), batch, background=white)
-        display = image.clamp(0, 1).pow(1 / 2.2).permute(0, 2, 3, 1).numpy()
+        display = encode(image.clamp(0, 1), "srgb").permute(0, 2, 3, 1).numpy()
         return np.concatenate(list(display), axis=1)
 
 

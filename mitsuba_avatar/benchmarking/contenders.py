@@ -12,6 +12,7 @@ import torch
 from mitsuba_avatar.benchmarking.workload import Workload
 from mitsuba_avatar.body.mesh import vertex_normals
 from mitsuba_avatar.body.rig import Rig
+from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.rendering.ambient_occlusion import LIFT, AmbientOcclusion
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.bridge import flat_array
@@ -50,10 +51,8 @@ class DirectProjective:
         mi = loaded_mitsuba()
         self.workload, self.seed = workload, 0
         topology = workload.rig.topology
-        pairs, corners = np.unique(
-            np.stack([topology.faces.ravel(), topology.uv_faces.ravel()], axis=1), axis=0, return_inverse=True
-        )  # vertices are split along seams: Mitsuba keeps texture coordinates at vertices
-        self.source = torch.from_numpy(pairs[:, 0])
+        split = split_at_seams(topology)  # Mitsuba keeps texture coordinates at vertices
+        self.source = torch.from_numpy(split.welded)
         # Mitsuba's bitmaps have row 0 at v = 0.
         self.textures = [mi.TensorXf(texture.flip(1).permute(1, 2, 0).contiguous()) for texture in workload.textures]
         emission = {
@@ -62,10 +61,10 @@ class DirectProjective:
         }
         properties = mi.Properties()
         properties["emitter"] = mi.load_dict(emission)
-        mesh = mi.Mesh("body", len(pairs), len(topology.faces), has_vertex_texcoords=True, props=properties)
+        mesh = mi.Mesh("body", len(split.uv), len(split.faces), has_vertex_texcoords=True, props=properties)
         tables = mi.traverse(mesh)
-        tables["faces"] = mi.UInt(corners.reshape(-1).astype(np.uint32))
-        tables["vertex_texcoords"] = mi.Float(topology.uv[pairs[:, 1]].astype(np.float32).ravel())
+        tables["faces"] = mi.UInt(split.faces.reshape(-1).astype(np.uint32))
+        tables["vertex_texcoords"] = mi.Float(split.uv.ravel())
         tables["vertex_positions"] = flat_array(workload.vertices[0][self.source])
         tables.update()
         self.scene = mi.load_dict({"type": "scene", "body": mesh})

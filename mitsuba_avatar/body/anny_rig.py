@@ -74,6 +74,11 @@ def build_anny_rig(phenotype: AnnyPhenotype = AnnyPhenotype()) -> Rig:  # noqa: 
     return rig
 
 
+def is_anny(rig: Rig) -> bool:
+    """Whether a rig is Anny's, with the facial actions and the humanoid skeleton that this package knows."""
+    return rig.name == "anny"
+
+
 def facial_action_displacements() -> tuple[tuple[str, ...], Float32[np.ndarray, "A V 3"]]:
     """Names of the 52 facial actions and what each adds to the rest vertices at strength one, [52, V, 3] metres.
 

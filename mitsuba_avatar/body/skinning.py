@@ -6,11 +6,31 @@ are a user's mistake: their sizes carry names of their own in the types and are 
 Source: arXiv:2105.10441, section 3.4.1 (posing) and 3.2 (unposing the registered mesh for the encoder).
 """
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
+from mitsuba_avatar.body.rig import Rig
+from mitsuba_avatar.body.skeleton import Skeleton
+
 SMALLEST_DETERMINANT = 1e-3  # of a blended matrix: below it a vertex is folded flat (a joint twisted by about 180 degrees)
+
+
+@torch.no_grad()
+def posed_rest_surface(rig: Rig, theta: Float[np.ndarray, "D"], root: Float[np.ndarray, "4 4"]) -> Float32[np.ndarray, "V 3"]:  # noqa: F821
+    """The rig's rest surface in one pose.
+
+    Args:
+        rig: skeleton and skin.
+        theta: [D] joint angles, radians.
+        root: [4, 4] rigid world_from_root.
+
+    Returns:
+        [V, 3] metres, world axes.
+    """
+    transforms = Skeleton(rig)(*(torch.from_numpy(np.array(values, np.float32))[None] for values in (theta, root)))
+    return pose_vertices(torch.from_numpy(rig.rest_vertices)[None], transforms, torch.from_numpy(rig.skinning_weights))[0].numpy()
 
 
 def blend_transforms(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from mitsuba_avatar.captures.cameras import Camera
@@ -19,6 +20,7 @@ from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
+from mitsuba_avatar.training.statistics import evenly_spaced
 
 PARTS = ("occlusion", "decoding", "rendering")
 
@@ -114,19 +116,19 @@ def posed_template(avatar: Avatar, theta: Float[Tensor, "1 D"]) -> Float[Tensor,
 
 @torch.no_grad()
 def outline(avatar: Avatar, signals: DrivingSignals, most_frames: int = 200) -> Float[np.ndarray, "P 3"]:
-    """Points that a camera must see to have the avatar in view all the time: extremes of the posed template, metres.
+    """Corners of the convex hull of the posed template over time: a camera that has them in view sees all of it, in every frame.
 
     Args:
         avatar: whose template is posed.
         signals: that pose it.
         most_frames: evenly spaced ones are looked at where there are more.
+
+    Returns:
+        [P, 3] metres, world axes.
     """
-    rows = np.unique(np.linspace(0, len(signals) - 1, min(most_frames, len(signals))).round().astype(int))
-    device = avatar.mean_texture.device
-    directions = np.random.default_rng(0).standard_normal((64, 3)).astype(np.float32)
-    points = []
-    for row in rows:
+    device, corners = avatar.mean_texture.device, np.zeros((0, 3), np.float32)
+    for row in evenly_spaced(list(range(len(signals))), most_frames):
         theta, root = (values[row : row + 1].to(device) for values in (signals.theta, signals.root))
-        template = avatar.pose_template(theta, root)[0].cpu().numpy()
-        points.append(template[np.unique((template @ directions.T).argmax(axis=0))])
-    return np.concatenate(points)
+        points = np.concatenate([corners, avatar.pose_template(theta, root)[0].cpu().numpy()])
+        corners = points[ConvexHull(points).vertices]
+    return corners

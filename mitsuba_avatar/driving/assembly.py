@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from mitsuba_avatar.body.anny_rig import is_anny
 from mitsuba_avatar.body.rig import Rig, load_rig
 from mitsuba_avatar.captures.description import load_description
 from mitsuba_avatar.captures.folder import DESCRIPTION_FILE, Capture
@@ -71,7 +72,7 @@ def assemble(
         values, found = _face_values(face, body, count)
         notes += found
         if face.kind.signal != wanted.signal:
-            model = None if rig.name != "anny" else FaceModel.of_rig(rig, _landmarks(wanted, training))
+            model = FaceModel.of_rig(rig, _landmarks(wanted, training)) if is_anny(rig) else None
             notes.append(f"face: {face.kind.signal} turned into {wanted.signal} through the rig's facial actions")
         else:
             model = None

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Float64
 from scipy.optimize import nnls
 
-from mitsuba_avatar.body.anny_rig import facial_action_displacements
+from mitsuba_avatar.body.anny_rig import facial_action_displacements, is_anny
 from mitsuba_avatar.body.driving import face_keypoints
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.captures.description import CaptureDescription
@@ -77,7 +77,7 @@ class FaceModel:
         Raises:
             ValueError: the rig has no facial actions that this package knows.
         """
-        if rig.name != "anny":
+        if not is_anny(rig):
             raise ValueError(
                 f"FaceModel.of_rig(): expected the Anny rig, whose facial actions are known; got {rig.name!r}. "
                 "Drive with a face signal of the kind that the avatar was trained on."

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from mitsuba_avatar.body.rig import Rig
+from mitsuba_avatar.driving.principal_directions import num_explaining
 from mitsuba_avatar.driving.signals import DrivingSignals
 
 TOLERANCE = 1e-5  # radians: less is rounding
@@ -92,8 +93,7 @@ class TrainingSubspace:
         rows = values.double().numpy()
         mean = rows.mean(0)
         _, singular, directions = np.linalg.svd(rows - mean, full_matrices=False)
-        share = np.cumsum(np.square(singular)) / max(float(np.square(singular).sum()), 1e-30)
-        directions = directions[: int(np.searchsorted(share, EXPLAINED)) + 1]
+        directions = directions[: num_explaining(singular, EXPLAINED)]
         coordinates = (rows - mean) @ directions.T
         return TrainingSubspace(mean, directions, REACH * coordinates.min(0), REACH * coordinates.max(0))
 

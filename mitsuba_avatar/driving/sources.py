@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mitsuba_avatar.body.anny_rig import facial_action_displacements
+from mitsuba_avatar.body.anny_rig import facial_action_displacements, is_anny
 from mitsuba_avatar.body.driving import face_keypoints
 from mitsuba_avatar.body.rig import Rig, load_rig
 from mitsuba_avatar.body.skeleton import Skeleton
@@ -180,7 +180,7 @@ def _body_of_capture(path: Path, rig: Rig, split: str) -> BodyTrack:
 
 def _body_of_bvh(path: Path, rig: Rig, fps: float, seconds: float) -> BodyTrack:
     recording = read_bvh(path)
-    if rig.name != "anny":
+    if not is_anny(rig):
         raise ValueError(
             f"load_body(): expected an avatar on the Anny rig for {path}; got {rig.name!r}. Drive it with its own pose angles."
         )

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from mitsuba_avatar.driving.principal_directions import num_explaining
 from mitsuba_avatar.driving.signals import DrivingSignals
 from mitsuba_avatar.driving.training_latents import TrainingLatents
 from mitsuba_avatar.files import atomic_path
@@ -214,8 +215,7 @@ def _input_projection(signal: Float64[np.ndarray, "N C"], dofs: int) -> tuple[Fl
 
 def _kept(values: Float64[np.ndarray, "R"]) -> int:  # noqa: F821
     """How many principal directions carry `EXPLAINED` of the variance; at least one, at most `MOST_DIRECTIONS`."""
-    share = np.cumsum(np.square(values)) / max(float(np.square(values).sum()), 1e-30)
-    return int(min(np.searchsorted(share, EXPLAINED) + 1, MOST_DIRECTIONS, len(values)))
+    return min(num_explaining(values, EXPLAINED), MOST_DIRECTIONS)
 
 
 def _inputs(

@@ -110,7 +110,7 @@ def latents_path(run: RunFolder, kind: str, checkpoint: str) -> Path:
     index = run.checkpoints.index()
     if index is None:
         raise FileNotFoundError(f"latents_path(): expected a checkpoint in {run.path}; got none. Train it first.")
-    return run.path / "latents" / f"{kind}_{index.best if checkpoint == 'best' else index.last:06d}.npz"
+    return run.path / "latents" / f"{kind}_{index.iteration_of(checkpoint):06d}.npz"
 
 
 def training_latents(

@@ -128,10 +128,11 @@ def make_character(avatar: Avatar, rig: Rig, capture: Capture, frames: Sequence[
     pose = principal_motion(motion.rest_vertices, settings.pose_shapes)
     face = _face_shapes(avatar, rig, capture, settings)
     influences = strongest_influences(rig.skinning_weights, settings.influences)
+    device = avatar.mean_texture.device
     with torch.no_grad():
-        theta, root = (torch.from_numpy(np.array(values[list(frames)], np.float32)) for values in (capture.theta, capture.root))
+        theta, root = (torch.from_numpy(np.array(values[list(frames)], np.float32)).to(device) for values in (capture.theta, capture.root))
         skinned = truncation_error_mm(
-            influences, torch.from_numpy(motion.rest_vertices), avatar.skeleton.cpu()(theta, root), torch.from_numpy(rig.skinning_weights)
+            influences, torch.from_numpy(motion.rest_vertices), avatar.skeleton(theta, root).cpu(), torch.from_numpy(rig.skinning_weights)
         )
     strengths = np.concatenate([np.zeros((len(frames), len(face.names)), np.float32), pose.strengths], axis=1)
     costs = {f"skinning with {settings.influences} joints a vertex": _rms_and_largest(skinned.numpy())}

@@ -12,9 +12,9 @@ import trimesh
 from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
+from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.exporting.character import Character
 from mitsuba_avatar.exporting.glb import from_gltf
-from mitsuba_avatar.exporting.seams import split_at_seams
 
 _DTYPES = {
     pygltflib.FLOAT: np.float32,

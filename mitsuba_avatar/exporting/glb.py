@@ -18,8 +18,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mitsuba_avatar.body.mesh import vertex_normals
+from mitsuba_avatar.body.split_mesh import SplitMesh, split_at_seams
 from mitsuba_avatar.exporting.character import Character
-from mitsuba_avatar.exporting.seams import SplitMesh, split_at_seams
 from mitsuba_avatar.files import atomic_path
 
 GLTF_FROM_OURS = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
@@ -129,11 +129,10 @@ def _add_mesh(packer: _Packer, character: Character, split: SplitMesh) -> int:
     normals = to_gltf(normals)[split.welded]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     normals[np.linalg.norm(normals, axis=1) < 0.5] = (0, 1, 0)  # vertices of faces without area have no normal, but the format wants one
-    uv = (split.uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)).astype(np.float32)
     attributes = pygltflib.Attributes(
         POSITION=packer.accessor(to_gltf(base)[split.welded], target, has_bounds=True),
         NORMAL=packer.accessor(normals.astype(np.float32), target),
-        TEXCOORD_0=packer.accessor(uv, target),
+        TEXCOORD_0=packer.accessor(split.image_uv, target),
     )
     joint_type = np.uint8 if len(character.rig.joint_names) <= 256 else np.uint16
     for part in range(character.influences.joints.shape[1] // 4):

@@ -5,6 +5,7 @@ texture coordinates at face corners, which it alone of the three can hold.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -12,7 +13,7 @@ from jaxtyping import Float32
 from PIL import Image
 
 from mitsuba_avatar.body.rig import Topology
-from mitsuba_avatar.exporting.seams import split_at_seams
+from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.files import atomic_path
 
 DIGITS = 7  # decimals in OBJ files: a tenth of a micrometre
@@ -56,7 +57,9 @@ class ObjSequence:
             temporary.write_text(text, encoding="utf-8")
 
 
-def write_usd(path: Path | str, vertices: Float32[np.ndarray, "N V 3"], topology: Topology, fps: float, texture: str) -> None:
+def write_usd(
+    path: Path | str, vertices: Float32[np.ndarray, "N V 3"], topology: Topology, fps: float, texture: str, is_lit: bool = False
+) -> None:
     """A point cache: one mesh whose points have a sample per frame, with a preview material.
 
     Args:
@@ -65,6 +68,7 @@ def write_usd(path: Path | str, vertices: Float32[np.ndarray, "N V 3"], topology
         topology: of all frames.
         fps: frames per second.
         texture: PNG that the material shows, relative to the file.
+        is_lit: the texture is albedo and lamps shall light it; else it is radiance and emitted as it is.
 
     Raises:
         ModuleNotFoundError: without the extra `usd`.
@@ -94,18 +98,17 @@ def write_usd(path: Path | str, vertices: Float32[np.ndarray, "N V 3"], topology
         for time, surface in enumerate(vertices):
             points.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(surface)), time)
             extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([surface.min(axis=0), surface.max(axis=0)])), time)
-        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_usd_material(stage, texture))
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_usd_material(stage, texture, is_lit))
         stage.GetRootLayer().Save()
 
 
-def _usd_material(stage, texture: str):  # noqa: ANN001, ANN202 - types of an optional package
-    """A preview surface that emits the texture: it is radiance."""
+def _usd_material(stage: Any, texture: str, is_lit: bool) -> Any:  # Usd.Stage -> UsdShade.Material, types of an optional package
+    """A preview surface that reflects the texture diffusely, or emits it."""
     from pxr import Sdf, UsdShade
 
     material = UsdShade.Material.Define(stage, "/avatar/material")
     surface = UsdShade.Shader.Define(stage, "/avatar/material/surface")
     surface.CreateIdAttr("UsdPreviewSurface")
-    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set((0.0, 0.0, 0.0))
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
     reader = UsdShade.Shader.Define(stage, "/avatar/material/uv")
     reader.CreateIdAttr("UsdPrimvarReader_float2")
@@ -117,6 +120,8 @@ def _usd_material(stage, texture: str):  # noqa: ANN001, ANN202 - types of an op
     coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
     image.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
     colour = image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
-    surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
+    shown, black = ("diffuseColor", "emissiveColor") if is_lit else ("emissiveColor", "diffuseColor")
+    surface.CreateInput(shown, Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
+    surface.CreateInput(black, Sdf.ValueTypeNames.Color3f).Set((0.0, 0.0, 0.0))
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     return material

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from mitsuba_avatar.body.anny_rig import facial_action_displacements
+from mitsuba_avatar.body.anny_rig import facial_action_displacements, is_anny
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.model.avatar import Avatar
 
@@ -71,7 +71,7 @@ def principal_motion(rest_vertices: Float32[np.ndarray, "N V 3"], count: int, pr
 
 def facial_actions(rig: Rig) -> Shapes | None:
     """The rig's own facial actions; None for a rig that has none (only Anny's do)."""
-    if not rig.name.startswith("anny"):
+    if not is_anny(rig):
         return None
     names, displacements = facial_action_displacements()
     if displacements.shape[1] != rig.topology.num_vertices:

@@ -3,9 +3,9 @@
 The cost is estimated from figures measured on two cores with Mitsuba's llvm variant; other machines differ, shares do not.
 """
 
-import re
 from dataclasses import dataclass
 
+from mitsuba_avatar.command_line import parse_shard
 from mitsuba_avatar.filming.settings import StudioSettings
 
 SHARE_OF_PERSON = 0.32  # of an image's pixels: only these are traced
@@ -65,12 +65,7 @@ class Shard:
         Raises:
             ValueError: for anything else, or i outside 0..n-1.
         """
-        if not text:
-            return cls()
-        match = re.fullmatch(r"(\d+)/(\d+)", text)
-        if not match or not int(match[1]) < int(match[2]):
-            raise ValueError(f"Shard.parse(): expected i/n with 0 <= i < n; got {text!r}. Write --shard 0/4, for example.")
-        return cls(int(match[1]), int(match[2]))
+        return cls(*parse_shard(text))
 
     def images(self, num_frames: int, num_cameras: int) -> dict[int, list[int]]:
         """Frame -> indices of the cameras whose image of it belongs to this shard. Consecutive frames, so that few segments are needed."""

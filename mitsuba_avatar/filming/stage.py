@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32
 
 from mitsuba_avatar.body.mesh import vertex_normals
 from mitsuba_avatar.body.rig import Topology
+from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.captures.cameras import Camera
 from mitsuba_avatar.filming.appearance import Appearance
 from mitsuba_avatar.filming.exposure import Exposure, visible_pixels
@@ -144,21 +145,18 @@ class _StagedMesh:
     def __init__(self, layer: Layer):
         topology = layer.topology
         shown = np.ones(len(topology.faces), dtype=bool) if layer.hidden_faces is None else ~layer.hidden_faces
-        corners = np.stack([topology.faces[shown].reshape(-1), topology.uv_faces[shown].reshape(-1)], axis=1)
-        pairs, corner_pair = np.unique(corners, axis=0, return_inverse=True)  # [S, 2] vertex and uv of each split vertex
+        split = split_at_seams(topology, shown)
         self.layer = layer
-        self.welded = pairs[:, 0]
+        self.welded = split.welded
         self.welded_faces = torch.from_numpy(topology.faces)
         self.shown_faces = topology.faces[shown]
 
         properties = mi.Properties()
         properties["bsdf"] = mi.load_dict(_surface(layer))
-        faces = corner_pair.reshape(-1, 3)
-        mesh = mi.Mesh(layer.name, len(pairs), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties)
-        uv = topology.uv[pairs[:, 1]] * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)  # Mitsuba's v runs down the image
+        mesh = mi.Mesh(layer.name, len(split.uv), len(split.faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties)
         parameters = mi.traverse(mesh)
-        parameters["faces"] = faces.astype(np.uint32).ravel()
-        parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
+        parameters["faces"] = split.faces.astype(np.uint32).ravel()
+        parameters["vertex_texcoords"] = split.image_uv.ravel()
         parameters.update()
         self.shape = mesh
 

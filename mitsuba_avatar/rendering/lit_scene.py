@@ -23,6 +23,7 @@ from torch import Tensor
 
 from mitsuba_avatar.body.mesh import vertex_normals
 from mitsuba_avatar.body.rig import Topology
+from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 
 Light = Literal["baked", "relit"]
@@ -137,8 +138,7 @@ def far_radiance(file: Path, height: int = 64) -> Float[Tensor, "3 height width"
 def _split_mesh(topology: Topology, texture_size: int, light: Light) -> tuple[np.ndarray, object]:
     """The welded vertex of each split one [S], and Mitsuba's mesh without positions yet."""
     mi = loaded_mitsuba()
-    corners = np.stack([topology.faces.reshape(-1), topology.uv_faces.reshape(-1)], axis=1)
-    pairs, corner_pair = np.unique(corners, axis=0, return_inverse=True)  # [S, 2] vertex and uv of each split vertex
+    split = split_at_seams(topology)
     bitmap = mi.Bitmap(np.zeros((texture_size, texture_size, 3), np.float32))
     texture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
     properties = mi.Properties()
@@ -147,11 +147,9 @@ def _split_mesh(topology: Topology, texture_size: int, light: Light) -> tuple[np
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": texture})
     else:
         properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}})
-    faces = corner_pair.reshape(-1, 3)
-    mesh = mi.Mesh("avatar", len(pairs), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties)
-    uv = topology.uv[pairs[:, 1]] * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)  # Mitsuba's v runs down the image
+    mesh = mi.Mesh("avatar", len(split.uv), len(split.faces), has_vertex_normals=True, has_vertex_texcoords=True, props=properties)
     parameters = mi.traverse(mesh)
-    parameters["faces"] = faces.astype(np.uint32).ravel()
-    parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
+    parameters["faces"] = split.faces.astype(np.uint32).ravel()
+    parameters["vertex_texcoords"] = split.image_uv.ravel()
     parameters.update()
-    return pairs[:, 0], mesh
+    return split.welded, mesh

@@ -7,13 +7,12 @@ cut, the insets and the colour scales. Images are display-encoded (sRGB), [H, W,
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter
 
-from mitsuba_avatar.reporting.figures import Tile, View, compose, error_map, to_bytes
+from mitsuba_avatar.reporting.figures import Tile, View, compose, error_map, heat_map, to_bytes
 from mitsuba_avatar.reporting.metrics import mean_over, mse_in_mask, psnr_from_mse
 from mitsuba_avatar.reporting.protocols import flip_map
 
@@ -120,7 +119,7 @@ def _view_rows(view: View, pictures: Mapping[str, Float[np.ndarray, "H W 3"]], h
     flip = [_scale_tile("FLIP error", "magma", FLIP_MAXIMUM)]
     for name, picture in pictures.items():
         absolute.append(tile(scores(name)[0], error_map(picture, view.image, ABSOLUTE_MAXIMUM)))
-        flip.append(tile(scores(name)[1], _heat(flips[name], "magma", FLIP_MAXIMUM)))
+        flip.append(tile(scores(name)[1], heat_map(flips[name], FLIP_MAXIMUM, "magma")))
     return [top, absolute, flip]
 
 
@@ -142,11 +141,7 @@ def _with_insets(image: Float[np.ndarray, "h w 3"], insets: Sequence[Cut], heigh
     return np.asarray(canvas, np.float32) / 255
 
 
-def _heat(errors: Float[np.ndarray, "H W"], name: str, maximum: float) -> Float[np.ndarray, "H W 3"]:
-    return matplotlib.colormaps[name](np.clip(errors / maximum, 0, 1))[..., :3].astype(np.float32)
-
-
 def _scale_tile(label: str, name: str, maximum: float) -> Tile:
     """The colours of an error map from 0 below to its maximum above."""
     ramp = np.repeat(np.linspace(maximum, 0, 256)[:, None], 24, axis=1)
-    return Tile(f"{label}: 0 (below) to {maximum:g}", _heat(ramp, name, maximum))
+    return Tile(f"{label}: 0 (below) to {maximum:g}", heat_map(ramp, maximum, name))

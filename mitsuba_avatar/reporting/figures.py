@@ -61,8 +61,18 @@ def error_map(
         raise ValueError(
             f"error_map(): expected images of one size; got {image.shape} and {reference.shape}. Render at the capture's size."
         )
-    error = np.abs(image - reference).mean(axis=-1)
-    return matplotlib.colormaps["inferno"](np.clip(error / maximum, 0, 1))[..., :3].astype(np.float32)
+    return heat_map(np.abs(image - reference).mean(axis=-1), maximum)
+
+
+def heat_map(values: Float[np.ndarray, "*shape"], maximum: float, colours: str = "inferno") -> Float[np.ndarray, "*shape 3"]:
+    """Display-encoded colours of values: black at 0, brightest at `maximum` and above.
+
+    Args:
+        values: of any shape.
+        maximum: above 0, in the values' unit.
+        colours: a colour map of Matplotlib's.
+    """
+    return matplotlib.colormaps[colours](np.clip(values / maximum, 0, 1))[..., :3].astype(np.float32)
 
 
 def preview_panel(previews: Sequence[Preview], height: int = 256) -> UInt8[np.ndarray, "h w 3"]:
@@ -165,7 +175,7 @@ def save_image(path: Path | str, image: UInt8[np.ndarray, "H W 3"] | Float[np.nd
         Image.fromarray(to_bytes(image)).save(temporary)
 
 
-def to_bytes(image: UInt8[np.ndarray, "H W 3"] | Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+def to_bytes(image: UInt8[np.ndarray, "*shape"] | Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """0..1 floats to 0..255 integers, rounded; values outside are cut, and what is not a number turns black."""
     if image.dtype == np.uint8:
         return image

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.command_line import parse_shard
 from mitsuba_avatar.rendering.cameras import CameraBatch
 from mitsuba_avatar.rendering.path_tracing import PathTracer, SampleBudget
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
@@ -157,12 +158,8 @@ def shard_of(text: str, items: Sequence[int]) -> list[int]:
     Raises:
         ValueError: not of the form i/n with 0 <= i < n.
     """
-    if not text:
-        return list(items)
-    index, slash, count = text.partition("/")
-    if not (slash and index.isdecimal() and count.isdecimal() and int(index) < int(count)):
-        raise ValueError(f"shard_of(): expected --shard i/n with 0 <= i < n, like 0/4; got {text!r}.")
-    return list(items)[int(index) :: int(count)]
+    index, count = parse_shard(text)
+    return list(items)[index::count]
 
 
 def _image(batch: Float[Tensor, "1 C H W"]) -> Float[np.ndarray, "H W C"]:

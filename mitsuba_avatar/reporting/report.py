@@ -176,11 +176,11 @@ class Report:
         best = groups.get("held_out") or groups.get("seen") or {}
         labels = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP", "iou": "silhouette IoU", "vertex_mm": "vertex error, mm"}
         numbers = {label: f"{best[name]:.4g}" for name, label in labels.items() if name in best}
-        iteration = run.run.checkpoints.index()
+        index = run.run.checkpoints.index()
         facts = [
             f"capture {run.evaluator.capture.path.name}, {len(run.evaluator.capture.frames)} frames, "
             f"{len(run.evaluator.capture.cameras)} cameras; checkpoint {run.checkpoint}"
-            + (f" (iteration {iteration.best if run.checkpoint == 'best' else iteration.last})" if iteration else ""),
+            + (f" (iteration {index.iteration_of(run.checkpoint)})" if index else ""),
             f"the figures below: {split} frames, {'held-out' if 'held_out' in groups else 'seen'} cameras, inside the mask",
         ]
         videos = [Figure(path, path.stem.replace("_", " ")) for path in sorted(run.run.path.glob("**/*.mp4"))]
@@ -229,7 +229,7 @@ class Report:
                     "run": str(run.run.path.resolve()),
                     "capture": str(run.evaluator.capture.path.resolve()),
                     "checkpoint": run.checkpoint,
-                    "iteration": None if index is None else index.best if run.checkpoint == "best" else index.last,
+                    "iteration": None if index is None else index.iteration_of(run.checkpoint),
                     "versions": facts.get("versions", {}),
                 }
             )

@@ -18,6 +18,7 @@ from PIL import Image, PngImagePlugin
 
 from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.files import atomic_path
+from mitsuba_avatar.reporting.figures import to_bytes
 
 WHITE = 4.0  # radiance that `soft` shows as white
 _PERCEPTUAL = b"\x00"  # rendering intent of the sRGB chunk
@@ -55,9 +56,9 @@ class ViewTransform:
         """
         scene = radiance * np.float32(2.0**self.exposure)
         if self.backdrop is not None:
-            return _bytes(self._shown(scene + (1 - coverage[..., None]) * np.float32(self.backdrop)))
+            return to_bytes(self._shown(scene + (1 - coverage[..., None]) * np.float32(self.backdrop)))
         straight = scene / np.maximum(coverage[..., None], np.float32(1e-6))  # where nothing is seen there is no colour to restore
-        return np.concatenate([_bytes(self._shown(straight)), _bytes(coverage[..., None])], axis=2)
+        return np.concatenate([to_bytes(self._shown(straight)), to_bytes(coverage[..., None])], axis=2)
 
     def describe(self) -> str:
         """What a file's text chunk says."""
@@ -77,7 +78,3 @@ def write_png(path: Path | str, picture: UInt8[np.ndarray, "H W C"], transform: 
     facts.add_text("view_transform", transform.describe())
     with atomic_path(path) as temporary:
         Image.fromarray(picture).save(temporary, pnginfo=facts)
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.round(255 * np.clip(np.nan_to_num(values), 0, 1)).astype(np.uint8)

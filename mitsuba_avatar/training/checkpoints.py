@@ -30,6 +30,10 @@ class CheckpointIndex:
     best: int
     best_psnr: float | None
 
+    def iteration_of(self, which: str) -> int:
+        """Iterations done by the "last" or "best" checkpoint."""
+        return {"last": self.last, "best": self.best}[which]
+
 
 class Checkpoints:
     """The checkpoint folder of one run.
@@ -121,7 +125,7 @@ class Checkpoints:
         index = self.index()
         if index is None:
             raise FileNotFoundError(f"Checkpoints: no checkpoint in {self.folder}. Start the fit again without --resume.")
-        return {"last": index.last, "best": index.best}[which]
+        return index.iteration_of(which)
 
     def _avatar_path(self, iteration: int) -> Path:
         return self.folder / f"avatar_{iteration:06d}.safetensors"

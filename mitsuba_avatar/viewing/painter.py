@@ -7,7 +7,6 @@ picture has the same silhouette and pixels. Symbols: S texels of the shading map
 import time
 from dataclasses import dataclass, field
 
-import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -23,6 +22,7 @@ from mitsuba_avatar.model.avatar import Avatar, AvatarOutput
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
+from mitsuba_avatar.reporting.figures import heat_map
 from mitsuba_avatar.viewing.state import Surface, ViewState
 from mitsuba_avatar.viewing.wireframe import draw_wireframe
 
@@ -181,8 +181,7 @@ class Painter:
             rest = self.avatar.decode_rest_vertices(theta.expand(count, -1), face.expand(count, -1), z)
             deviation = (rest - rest.mean(0)).square().sum(-1).mean(0).sqrt()  # [V] metres
             self._spread = (key, self.atlas.texels_from_vertices(deviation.cpu()[None, :, None]))
-        share = (1000 * self._spread[1][0, 0] / UNCERTAINTY_MAXIMUM_MM).clamp(0, 1)
-        colours = matplotlib.colormaps["inferno"](share.numpy())[..., :3].astype(np.float32)
+        colours = heat_map(1000 * self._spread[1][0, 0].numpy(), UNCERTAINTY_MAXIMUM_MM)
         return torch.from_numpy(colours).permute(2, 0, 1)[None]
 
     def _toned(self, radiance: Float[Tensor, "1 3 H W"]) -> UInt8[np.ndarray, "H W 3"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from mitsuba_avatar.viewing.directions import PrincipalDirections
+from mitsuba_avatar.driving.principal_directions import PrincipalDirections
 
 MARGIN = 0.08  # of the map's side, around the points
 REACH = 0.06  # of the map's side: a click farther from every point than this picks none

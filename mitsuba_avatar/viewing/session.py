@@ -20,11 +20,11 @@ from torch import Tensor
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.captures.cameras import Camera, look_at
 from mitsuba_avatar.driving.imputation import FROM_TRAINING, make_imputation
+from mitsuba_avatar.driving.principal_directions import PrincipalDirections
 from mitsuba_avatar.driving.signals import DrivingSignals
 from mitsuba_avatar.driving.training_latents import TrainingLatents
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
-from mitsuba_avatar.viewing.directions import PrincipalDirections
 from mitsuba_avatar.viewing.painter import MOVING, STILL, UNCERTAINTY_MAXIMUM_MM, UNCERTAINTY_SAMPLES, Painter, Quality
 from mitsuba_avatar.viewing.pose_map import PoseMap
 from mitsuba_avatar.viewing.state import ViewState, limb_groups

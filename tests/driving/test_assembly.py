@@ -101,9 +101,9 @@ def test_the_outline_holds_every_vertex_of_every_frame(fitted_avatar):
     points = outline(fitted_avatar, signals)
     with torch.no_grad():
         everything = fitted_avatar.pose_template(signals.theta, signals.root).flatten(0, 1).numpy()
-    assert len(points) < len(everything)
-    np.testing.assert_allclose(points.min(0), everything.min(0), atol=0.01)
-    np.testing.assert_allclose(points.max(0), everything.max(0), atol=0.01)
+    assert len(points) < 0.5 * len(everything)
+    for direction in np.random.default_rng(0).normal(size=(50, 3)):
+        np.testing.assert_allclose((points @ direction).max(), (everything @ direction).max(), rtol=1e-5)
 
 
 def test_in_place_leaves_out_the_way_and_keeps_the_height():

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from mitsuba_avatar.body.skeleton import Skeleton
+from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.exporting.influences import strongest_influences, truncation_error_mm
-from mitsuba_avatar.exporting.seams import split_at_seams
 from mitsuba_avatar.exporting.shapes import facial_actions, principal_motion
 from tests.small_rig import make_small_rig
 

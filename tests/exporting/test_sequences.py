@@ -48,3 +48,15 @@ def test_usd_point_cache(tmp_path):
     )
     assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode(), UsdGeom.GetStageUpAxis(stage)) == (12.0, 2.0, "Z")
     assert [path.name for path in tmp_path.iterdir()] == ["a.usdc"]
+
+
+@pytest.mark.parametrize(("is_lit", "shown", "black"), [(False, "emissiveColor", "diffuseColor"), (True, "diffuseColor", "emissiveColor")])
+def test_usd_shows_radiance_as_it_is_and_lets_lamps_light_albedo(tmp_path, is_lit, shown, black):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdShade
+
+    write_usd(tmp_path / "a.usdc", MOVING, RIG.topology, 12.0, "textures/a.png", is_lit)
+    stage = usd.Stage.Open(str(tmp_path / "a.usdc"))  # a prim lives no longer than its stage
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/avatar/material/surface"))
+    assert surface.GetInput(shown).HasConnectedSource() and not surface.GetInput(black).HasConnectedSource()
+    assert tuple(surface.GetInput(black).Get()) == (0, 0, 0)

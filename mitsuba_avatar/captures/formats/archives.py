@@ -2,7 +2,7 @@
 
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from mitsuba_avatar.files import atomic_path
@@ -75,7 +75,7 @@ class Archive:
             ) from error
 
 
-def write_archive(path: Path, members: Sequence[str], contents) -> None:
+def write_archive(path: Path, members: Sequence[str], contents: Callable[[int], bytes]) -> None:
     """Write an uncompressed zip, whole or not at all.
 
     Args:

@@ -4,7 +4,7 @@ AvatarReX: calibration_full.json, <camera>/<frame:08d>.jpg, <camera>/mask/pha/<f
 THuman4.0: calibration.json, images/<camera>/<frame:08d>.jpg, masks/<camera>/<frame:08d>.jpg.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -87,7 +87,9 @@ def open_thuman4(path: Path | str, options: SourceOptions = SourceOptions()) -> 
     return _open(path, path / "calibration.json", recorded, folders, options, "THuman4.0")
 
 
-def _open(path: Path, calibration: Path, recorded: list[str], folders, options: SourceOptions, data_set: str) -> AvatarRexSource:
+def _open(
+    path: Path, calibration: Path, recorded: list[str], folders: Callable[[str], tuple[Path, Path]], options: SourceOptions, data_set: str
+) -> AvatarRexSource:
     """What both have in common; `folders` gives a camera's folders of images and masks."""
     require_file(calibration, "Name the folder of one subject.")
     document = parse_json(calibration.read_bytes(), str(calibration))

@@ -1,4 +1,5 @@
-"""Principal directions of a set of vectors: handles for signals that have too many entries to turn one by one."""
+"""Principal directions of a set of vectors: handles for signals that have too many entries to turn one by one,
+and what such signals are kept to."""
 
 from dataclasses import dataclass
 
@@ -37,3 +38,9 @@ class PrincipalDirections:
     def coordinates(self, samples: Float[np.ndarray, "N C"]) -> Float[np.ndarray, "N K"]:
         """[N, K] standard deviations along each direction, from the mean."""
         return (np.asarray(samples, np.float64) - self.mean) @ (self.steps / np.square(self.steps).sum(axis=1, keepdims=True)).T
+
+
+def num_explaining(singular: Float[np.ndarray, "R"], share: float) -> int:  # noqa: F821
+    """How many principal directions, one at least, carry a share (0..1) of the variance; `singular` are the singular values, falling."""
+    carried = np.cumsum(np.square(singular)) / max(float(np.square(singular).sum()), 1e-30)  # samples that do not vary have no variance
+    return min(int(np.searchsorted(carried, share)) + 1, len(singular))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mitsuba_avatar.viewing.directions import PrincipalDirections
+from mitsuba_avatar.driving.principal_directions import PrincipalDirections, num_explaining
 
 
 def cloud() -> np.ndarray:
@@ -31,3 +31,9 @@ def test_coordinates_and_offsets_are_inverse_to_each_other():
 
 def test_samples_that_do_not_vary_have_no_directions():
     assert PrincipalDirections.of(np.ones((4, 3)), 2).steps.shape == (0, 3)
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.5, 1), (0.79, 1), (0.81, 2), (0.99, 3), (1.0, 3)])
+def test_as_many_directions_are_kept_as_carry_the_share_of_the_variance(share, count):
+    assert num_explaining(np.sqrt([80.0, 15.0, 5.0]), share) == count
+    assert num_explaining(np.zeros(3), share) == 3, "nothing is left out where nothing varies"
