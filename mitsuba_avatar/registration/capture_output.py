@@ -12,6 +12,8 @@ from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.captures.frames import Frame
 from mitsuba_avatar.captures.images import read_mask
 from mitsuba_avatar.captures.writer import CaptureWriter
+from mitsuba_avatar.registration.colour_agreement import ColourAgreement
+from mitsuba_avatar.registration.colour_correction import corrected_image, keep_corrections
 from mitsuba_avatar.registration.frames import FrameFolder
 from mitsuba_avatar.registration.keypoints_2d import LANDMARKS
 from mitsuba_avatar.registration.keypoints_3d import PersonKeypoints
@@ -29,7 +31,7 @@ def write_capture(
     recording: Recording,
     settings: OutputSettings,
     body: RegisteredBody,
-    parts: tuple[FrameFolder, MaskFolder, PersonKeypoints, RegistrationQuality],
+    parts: tuple[FrameFolder, MaskFolder, PersonKeypoints, RegistrationQuality, ColourAgreement],
     progress: Callable[[int, int], None],
     before_end: Callable[[], None] = lambda: None,
 ) -> Capture:
@@ -42,14 +44,14 @@ def write_capture(
         recording: gives the frame rate.
         settings: names, split, held-out cameras.
         body: registered.
-        parts: images, masks, keypoints, and which frames are kept.
+        parts: images, masks, keypoints, which frames are kept, and what corrects the cameras' colours.
         progress: called as progress(done, total).
         before_end: writes whatever else belongs into the folder, when all is there but capture.yaml.
 
     Raises:
         FileExistsError: if the folder holds another capture.
     """
-    frames, masks, person, quality = parts
+    frames, masks, person, quality, colour = parts
     kept = np.flatnonzero(quality.is_kept)
     rig = body.rig()
     description = CaptureDescription(
@@ -62,14 +64,15 @@ def write_capture(
         source=settings.source,
     )
     listed = [
-        Frame(int(number), float(number) / recording.fps, _split(index, len(kept), settings.test_share), "recording")
+        Frame(int(number), float(number) / recording.fps, split_of(index, len(kept), settings.test_share), "recording")
         for index, number in enumerate(kept)
     ]
     writer = CaptureWriter(out, description, frames.cameras, listed)
+    keep_corrections(out, colour)
     for index, number in enumerate(kept.tolist()):
         for name in frames.cameras:
             if not writer.has_image(name, index):
-                writer.write_image(name, index, frames.image(name, number))
+                writer.write_image(name, index, corrected_image(frames.image(name, number), colour.matrices[name]))
             writer.write_mask(name, index, read_mask(masks.mask_path(name, number)))
         progress(index + 1, len(kept))
     sequence = sequence_of(body.fitted)
@@ -86,7 +89,7 @@ def write_capture(
     return writer.finish()
 
 
-def _split(index: int, count: int, test_share: float) -> Literal["train", "test"]:
+def split_of(index: int, count: int, test_share: float) -> Literal["train", "test"]:
     """The last share of the frames tests; at least one where any is asked for."""
     tests = max(1, round(test_share * count)) if test_share > 0 else 0
     return "test" if index >= count - tests else "train"

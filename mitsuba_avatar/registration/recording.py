@@ -5,6 +5,7 @@ Calib.qca.txt  or  cameras.json              the calibration; its names of camer
 <camera>.mp4                                 or mov, avi, mkv, webm; also in videos/
 keypoints_2d/<camera>/*.json                 a file a frame, as OpenPose writes them, in order of their names
 masks/<camera>/*.png                         optional: a file a frame, white is the person, at the video's size
+chart/chart.json  chart/<camera>.png         optional: pictures of a colour chart (captures/colour_calibration.py)
 ```
 """
 

@@ -14,10 +14,13 @@ from jaxtyping import Float32
 
 from mitsuba_avatar.body.anny_rig import AnnyPhenotype, build_anny_rig
 from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.captures.colour_calibration import CHART_FILE, calibrate_cameras
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.registration.body_shape import PARAMETERS
 from mitsuba_avatar.registration.camera_refinement import RefinedCameras, refine_cameras, unrefined
-from mitsuba_avatar.registration.capture_output import write_capture
+from mitsuba_avatar.registration.capture_output import split_of, write_capture
+from mitsuba_avatar.registration.colour_agreement import ColourAgreement, agree, read_agreement, stored_agreement
+from mitsuba_avatar.registration.colour_samples import ColourSampler, shared_colours
 from mitsuba_avatar.registration.frames import FrameFolder, capture_cameras, full_cameras, undistort_videos
 from mitsuba_avatar.registration.keypoint_fit import FittedBody, KeypointEnergy, fit_keypoints
 from mitsuba_avatar.registration.keypoints_3d import PersonKeypoints, find_person, triangulate_person
@@ -37,6 +40,8 @@ from mitsuba_avatar.registration.silhouette_refinement import (
 from mitsuba_avatar.registration.stage_folder import StageFolder, stage_key
 
 WORK_FOLDER = ".registration"
+CHART_FOLDER = "chart"
+COLOUR_FRAMES = 50  # at most, evenly spaced, that tell of the cameras' colours
 # Called with the name of the stage, how much is done, and out of how much.
 Progress = Callable[[str, int, int], None]
 
@@ -62,6 +67,12 @@ class Registration:
                 f"Registration(): expected output.held_out_cameras among {sorted(recording.views)}, and some left to learn from; got "
                 f"{list(settings.output.held_out_cameras)}. Correct the names."
             )
+        reference = settings.output.colour_reference
+        if reference and (reference not in recording.views or reference in settings.output.held_out_cameras):
+            raise ValueError(
+                f"Registration(): expected output.colour_reference among the cameras that train, of {sorted(recording.views)}; got "
+                f"{reference!r}. Name one that is not held out, or leave it empty."
+            )
         self.stages = StageFolder(out / WORK_FOLDER)
         self.source_key = stage_key([_stamp(path) for view in recording.views.values() for path in (view.video, *view.masks)])
         cameras = capture_cameras(recording, settings.output.width, settings.output.height)
@@ -74,15 +85,17 @@ class Registration:
         fitted, key = self._fit(person, list(full.values()), key)
         frames = self._frames(cameras)
         energy = KeypointEnergy(list(full.values()), person.observations, self.recording.fps, self.settings.pose, self.settings.body)
-        body, masks = self._refine(fitted, frames, energy, key)
+        body, masks, key = self._refine(fitted, frames, energy, key)
         before = RegisteredBody(fitted, np.zeros_like(body.shared_offset), np.zeros_like(body.frame_offsets))
         bodies = {"before": before, "after": body}
         quality = measure(bodies, frames, masks, energy, self.settings.refinement, lambda *done: self.progress("measure", *done))
 
-        def report() -> None:
-            write_report(self.out, quality, refined, fitted.phenotype, body.fitted.phenotype, self.settings)
+        colour = self._colour(body, frames, masks, np.flatnonzero(quality.is_kept).tolist(), key)
 
-        parts = (frames, masks, person, quality)
+        def report() -> None:
+            write_report(self.out, quality, refined, fitted.phenotype, body.fitted.phenotype, self.settings, colour)
+
+        parts = (frames, masks, person, quality, colour)
         write = self.settings.output
         capture = write_capture(self.out, self.recording, write, body, parts, lambda *done: self.progress("write", *done), report)
         return capture, quality
@@ -136,7 +149,7 @@ class Registration:
             self.stages.mark_done("frames", key)
         return frames
 
-    def _refine(self, fitted: FittedBody, frames: FrameFolder, energy: KeypointEnergy, key: str) -> tuple[RegisteredBody, MaskFolder]:
+    def _refine(self, fitted: FittedBody, frames: FrameFolder, energy: KeypointEnergy, key: str) -> tuple[RegisteredBody, MaskFolder, str]:
         """Rounds of cutting out and refining; the last one adds offsets."""
         settings, output = self.settings, self.settings.output
         num_vertices = build_anny_rig(fitted.phenotype).topology.num_vertices
@@ -164,7 +177,29 @@ class Registration:
 
             stored = self.stages.arrays(f"refined_{index + 1}", key, make)
             body = RegisteredBody(_read_fit(stored), stored["shared_offset"], stored["frame_offsets"])
-        return body, masks
+        return body, masks, key
+
+    def _colour(self, body: RegisteredBody, frames: FrameFolder, masks: MaskFolder, kept: list[int], key: str) -> ColourAgreement:
+        """Corrections of the cameras' colours, from frames that train; those for testing have no say."""
+        output, chart = self.settings.output, _chart_corrections(self.recording)
+        training = [number for index, number in enumerate(kept) if split_of(index, len(kept), output.test_share) == "train"] or kept
+        chosen = training[:: -(-len(training) // COLOUR_FRAMES)]
+        names = list(frames.cameras)
+        charted = None if chart is None else [(name, chart[name].tolist()) for name in names]
+        key = stage_key(key, chosen, output.held_out_cameras, output.colour_correction, output.colour_reference, charted)
+
+        def make() -> dict[str, np.ndarray]:
+            sampler, sequence = ColourSampler(body.rig(), frames.cameras), sequence_of(body.fitted)
+
+            def look(frame: int) -> tuple[np.ndarray, np.ndarray]:
+                images = np.stack([frames.image(name, frame) for name in names])
+                return sampler.look(posed_vertices(body, sequence, [frame])[0], images, masks.read(names, frame))
+
+            shared = shared_colours(names, chosen, look, lambda *done: self.progress("colour", *done))
+            use_chart = chart if output.colour_correction == "auto" else None
+            return stored_agreement(agree(shared, output.held_out_cameras, output.colour_correction, output.colour_reference, use_chart))
+
+        return read_agreement(self.stages.arrays("colour", key, make))
 
     def _masks(self, body: RegisteredBody, frames: FrameFolder, key: str, index: int) -> MaskFolder:
         masks = MaskFolder(self.stages.path / f"masks_{key}")
@@ -183,6 +218,25 @@ class Registration:
             write_masks(masks, frames, problem, pose, self.settings.masks, lambda *d: self.progress(f"masks {index + 1}", *d))
         self.stages.mark_done(name, key)
         return masks
+
+
+def _chart_corrections(recording: Recording) -> dict[str, np.ndarray] | None:
+    """Corrections from pictures of a colour chart, if there are any.
+
+    Raises:
+        ValueError: if a camera has no picture of it.
+    """
+    folder = recording.path / CHART_FOLDER
+    if not (folder / CHART_FILE).is_file():
+        return None
+    corrections = calibrate_cameras(folder, "srgb")
+    missing = sorted(set(recording.views) - set(corrections))
+    if missing:
+        raise ValueError(
+            f"Registration(): expected every camera in {folder / CHART_FILE}; got none of {missing}. Photograph the chart with them too, "
+            f"or take {CHART_FOLDER}/ away."
+        )
+    return corrections
 
 
 def _problem(fitted: FittedBody, frames: FrameFolder, masks: MaskFolder, names: list[str], scale: float) -> SilhouetteProblem:

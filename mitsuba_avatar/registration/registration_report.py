@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32
 from mitsuba_avatar.body.anny_rig import AnnyPhenotype
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.registration.camera_refinement import RefinedCameras
+from mitsuba_avatar.registration.colour_agreement import ColourAgreement
 from mitsuba_avatar.registration.frames import FrameFolder
 from mitsuba_avatar.registration.keypoint_fit import KeypointEnergy
 from mitsuba_avatar.registration.masks import MaskFolder
@@ -96,16 +97,25 @@ def write_report(
     fitted_phenotype: AnnyPhenotype,
     phenotype: AnnyPhenotype,
     settings: RegistrationSettings,
+    colour: ColourAgreement,
 ) -> None:
     """Write `registration.json`: medians and means over the kept frames, per camera too, dropped frames, corrections, settings."""
     document = summary(quality) | {
         "frames_dropped": quality.dropped,
+        "colour": {
+            "correction": colour.correction,
+            "reference": colour.reference,
+            "disagreement": {kind: _rounded(value) for kind, value in colour.candidates.items()},
+        },
         "cameras": {
             name: {
                 "is_held_out": name in settings.output.held_out_cameras,
                 **_figures(quality, [index]),
                 "turned_degrees": round(float(np.degrees(refined.turned[name])), 3),
                 "shifted_metres": round(refined.shifted[name], 4),
+                "colour_disagreement_before": _rounded(colour.before[name]),
+                "colour_disagreement_after": _rounded(colour.after[name]),
+                "colour_samples": colour.samples[name],
             }
             for index, name in enumerate(quality.cameras)
         },
@@ -121,6 +131,11 @@ def summary(quality: RegistrationQuality) -> dict[str, float | int]:
     """The figures over all cameras and kept frames."""
     figures = _figures(quality, list(range(len(quality.cameras))))
     return figures | {"frames_kept": int(quality.is_kept.sum()), "frames": len(quality.is_kept)}
+
+
+def _rounded(levels: float) -> float | None:
+    """For JSON, which has no NaN."""
+    return round(levels, 2) if np.isfinite(levels) else None
 
 
 def _figures(quality: RegistrationQuality, cameras: list[int]) -> dict[str, float | None]:

@@ -9,6 +9,7 @@ from typing import Literal
 
 from mitsuba_avatar.settings import expect
 
+ColourCorrection = Literal["auto", "none", "gains", "affine"]
 KeypointOrder = Literal["auto", "body_25", "body_25b", "coco", "openpose_coco", "halpe_26"]
 
 
@@ -23,6 +24,8 @@ class OutputSettings:
     test_share: float = 0.15  # of the kept frames, at the end, for testing
     licence: str = ""
     source: str = ""
+    colour_correction: ColourCorrection = "auto"  # of each camera's linear radiance; auto takes what agrees best on frames left out
+    colour_reference: str = ""  # camera whose colours stay as they are; empty: the one that shares most of the surface with others
 
     def __post_init__(self) -> None:
         expect(self, "positive", "width", "height")
