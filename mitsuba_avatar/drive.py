@@ -1,4 +1,4 @@
-"""Drive a fitted avatar: `python -m mitsuba_avatar.drive --run RUN --pose FILE [--face FILE] [--imputation NAME] [--path orbit]`.
+"""Drive a fitted avatar: `python -m mitsuba_avatar.drive RUN --pose FILE [--face FILE] [--imputation NAME] [--path orbit]`.
 
 Body and face come from captures, our arrays, BVH, Live Link Face or action codes; the latent code, which nobody measures, is imputed.
 Writes a video or pictures, an overview and drive.json; prints frames per second of decoding and of rendering. docs/driving.md has the rest.
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -42,7 +42,7 @@ ImputationChoice = Literal["zero", "mean", "prior", "clip", "nearest", "temporal
 class DriveCommand:
     """Drive a run's avatar with a recording."""
 
-    run: Path  # run folder that fit wrote
+    run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
     pose: str = ""  # what moves the body: capture, folder of arrays, .npy, .bvh; default: the run's capture
     face: str = ""  # what moves the face: capture, .npy, .csv; default: that of --pose, or the mean training face
     imputation: ImputationChoice = "zero"  # of the latent code

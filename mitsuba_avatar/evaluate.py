@@ -23,7 +23,7 @@ class EvaluateCommand:
     capture: str = ""  # another capture of the same rig; default: the one it was trained on
     frames: int = 0  # frames per split; default: the run's setting evaluation.frames_per_split
     checkpoint: str = "last"  # best or last
-    output: str = ""  # where metrics go; default: RUN/metrics.json; the pictures' CSV lies beside it
+    out: str = ""  # where metrics go; default: RUN/metrics.json; the pictures' CSV lies beside it
     protocols: tuple[Literal["mask", "image", "box"], ...] = ("mask", "image", "box")  # regions that image errors are averaged over
     flip: bool = True  # measure FLIP, which takes longer than everything else
     flicker_frames: int = 4  # frames per split whose flicker is measured; 0 for none
@@ -56,7 +56,7 @@ def _evaluate(command: EvaluateCommand) -> int:
     from mitsuba_avatar.reporting.tables import terminal_table
 
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
-    output = Path(command.output) if command.output else loaded.run.metrics_path
+    output = Path(command.out) if command.out else loaded.run.metrics_path
     check_writable(output.parent)
     evaluator = loaded.evaluator()
     frames = evaluator.split_frames(command.frames or loaded.run.settings.evaluation.frames_per_split)

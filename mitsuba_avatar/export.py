@@ -38,7 +38,7 @@ class ExportCommand:
     validate: bool = False  # glb: also run the Khronos validator (node and the npm package gltf-validator)
     capture: str = ""  # driving capture of the same rig; default: the run's
     checkpoint: str = "last"  # best or last
-    output: str = ""  # folder; default: RUN/export
+    out: str = ""  # folder; default: RUN/export
     variant: str = "auto"  # Mitsuba variant
 
 
@@ -64,7 +64,7 @@ def _export(command: ExportCommand) -> Path:
 
     settings = CharacterSettings(command.influences, command.pose_shapes, command.face_shapes)
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
-    folder = Path(command.output) if command.output else loaded.run.path / "export"
+    folder = Path(command.out) if command.out else loaded.run.path / "export"
     check_writable(folder)
     frames = loaded.capture.frame_indices(command.split)
     frames = frames[: command.frames] if command.frames else frames

@@ -1,4 +1,4 @@
-"""Reconstruct frames with a fitted avatar: `python -m mitsuba_avatar.reconstruct --run RUN [--split test] [--frames 8]`.
+"""Reconstruct frames with a fitted avatar: `python -m mitsuba_avatar.reconstruct RUN [--split test] [--frames 8]`.
 
 Root pose, joint angles, face and latent code are found by gradient descent through the renderer, frame after frame, from the views of
 the training cameras. Prints and writes the errors before and after, beside those of driving with a zero latent code, on training and
@@ -11,7 +11,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -33,7 +33,7 @@ SHOWN = 4  # frames of the picture
 class ReconstructCommand:
     """Reconstruct frames of a capture with a run's avatar."""
 
-    run: Path  # run folder that fit wrote
+    run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
     capture: str = ""  # another capture of the same rig; default: the one it was trained on
     split: Literal["test", "train"] = "test"
     first: int | None = None  # number of the first frame; default: the split's

@@ -59,7 +59,7 @@ class RenderCommand:
     exposure: float = 0.0  # stops, of png and mp4
     backdrop: float | None = 0.18  # linear radiance behind the person; None: transparent
     fps: float = 12.0  # of mp4
-    output: str = ""  # folder; default: RUN/renders/<path>[_<scene>_<light>]
+    out: str = ""  # folder; default: RUN/renders/<path>[_<scene>_<light>]
     variant: str = "auto"  # Mitsuba variant
 
 
@@ -239,7 +239,7 @@ def _video(command: RenderCommand, folder: "PictureFolder", views: list["NovelVi
 
 def _output(command: RenderCommand, loaded: "LoadedRun") -> Path:
     name = command.path + (f"_{Path(command.scene).stem}_{command.light}" if command.scene else "")
-    return Path(command.output) if command.output else loaded.run.path / "renders" / name
+    return Path(command.out) if command.out else loaded.run.path / "renders" / name
 
 
 def _picture_settings(command: RenderCommand, loaded: "LoadedRun") -> dict[str, Any]:

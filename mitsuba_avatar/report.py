@@ -1,4 +1,4 @@
-"""Report on fitted avatars: `python -m mitsuba_avatar.report RUN [RUN...] [--output DIR]`.
+"""Report on fitted avatars: `python -m mitsuba_avatar.report RUN [RUN...] [--out DIR]`.
 
 Writes comparison with insets and error maps, LaTeX tables, vector curves, per-camera and per-frame CSV, settings, and for each run a page
 that needs nothing else. Figures come from metrics.json and metrics.csv of the runs; what `evaluate` has not measured yet is measured now.
@@ -23,7 +23,7 @@ class ReportCommand:
     """Figures, tables and pages of one or several runs."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]  # run folders that fit wrote
-    output: str = ""  # folder; default: RUN/report, or report beside the first of several runs
+    out: str = ""  # folder; default: RUN/report, or report beside the first of several runs
     views: int = 4  # of the comparison
     frames: int = 4  # frames per split that are measured where a run has no metrics.csv
     measure: bool = False  # measure anew, whatever there is
@@ -54,7 +54,7 @@ def _report(command: ReportCommand) -> Path:
     from mitsuba_avatar.reporting.report import Report
 
     first = command.runs[0].resolve()
-    folder = Path(command.output) if command.output else (first if len(command.runs) == 1 else first.parent) / "report"
+    folder = Path(command.out) if command.out else (first if len(command.runs) == 1 else first.parent) / "report"
     check_writable(folder)
     report = Report([_reported(path, name, command) for path, name in zip(command.runs, _names(command.runs), strict=True)], folder)
     report.write_tables()

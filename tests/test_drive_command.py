@@ -24,7 +24,7 @@ def frames_of(path) -> list[np.ndarray]:
 
 def test_the_test_split_drives_as_a_video_with_a_report(fitted_run, private_cache, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["--run", str(fitted_run), *SMALL, "--out", str(out)]) == 0
+    assert main([str(fitted_run), *SMALL, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "setting: matched" in printed and "all 5 angles of 2 frames were in range" in printed
     assert "decoding" in printed and "rendering" in printed and printed.strip().endswith(str(out))
@@ -38,7 +38,7 @@ def test_the_test_split_drives_as_a_video_with_a_report(fitted_run, private_cach
 
 def test_held_out_cameras_see_the_driven_person_where_the_capture_has_it(fitted_run, drawn_capture, private_cache, tmp_path):
     words = ("--path", "held_out", "--format", "png", "--split", "test")
-    assert main(["--run", str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
+    assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
     (name,) = drawn_capture.camera_names(held_out=True)
     for row, index in enumerate((8, 9)):
         picture = read_image(tmp_path / f"out/{row:06d}.png").astype(np.float32) / 255
@@ -50,7 +50,7 @@ def test_held_out_cameras_see_the_driven_person_where_the_capture_has_it(fitted_
 def test_what_has_no_cameras_is_seen_by_the_held_out_ones_of_the_run_s_capture(fitted_run, drawn_capture, private_cache, tmp_path):
     np.save(tmp_path / "theta.npy", np.array(drawn_capture.theta[:1]))
     words = ("--pose", str(tmp_path / "theta.npy"), "--path", "held_out", "--format", "png")
-    assert main(["--run", str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
+    assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
     assert read_image(tmp_path / "out/000000.png").shape == (HEIGHT, WIDTH, 3)
 
 
@@ -59,7 +59,7 @@ def test_arrays_out_of_range_are_held_or_projected_and_reported(fitted_run, draw
     theta[1, 2] = 2.2 + 0.5  # the elbow bends no farther than 2.2
     np.save(tmp_path / "theta.npy", theta)
     shutil.copytree(fitted_run, tmp_path / "run")
-    words = ("--run", str(tmp_path / "run"), "--pose", str(tmp_path / "theta.npy"), *SMALL, "--format", "png")
+    words = (str(tmp_path / "run"), "--pose", str(tmp_path / "theta.npy"), *SMALL, "--format", "png")
     pictures = {}
     for name in ("none", "clamp", "project"):
         assert main([*words, "--range", name, "--out", str(tmp_path / name)]) == 0
@@ -74,7 +74,7 @@ def test_arrays_out_of_range_are_held_or_projected_and_reported(fitted_run, draw
 
 def test_imputations_change_the_picture_and_the_temporal_model_is_kept(fitted_run, private_cache, tmp_path, capsys):
     shutil.copytree(fitted_run, tmp_path / "run")
-    words = ("--run", str(tmp_path / "run"), *SMALL, "--format", "png")
+    words = (str(tmp_path / "run"), *SMALL, "--format", "png")
     pictures = {}
     for name in ("zero", "prior", "nearest", "temporal"):
         assert main([*words, "--imputation", name, "--out", str(tmp_path / name)]) == 0
@@ -91,7 +91,7 @@ def test_imputations_change_the_picture_and_the_temporal_model_is_kept(fitted_ru
 @pytest.mark.parametrize("path", ["orbit", "turntable", "spiral"])
 def test_cameras_go_around(fitted_run, private_cache, tmp_path, path):
     words = ("--path", path, *SMALL, "--format", "png", "--split", "train", "--seconds", "0.3")
-    assert main(["--run", str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
+    assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
     first, second = (read_image(tmp_path / f"out/00000{row}.png").astype(float) for row in (0, 1))
     assert np.abs(first - second).mean() > 2
     for picture in (first, second):
@@ -101,7 +101,7 @@ def test_cameras_go_around(fitted_run, private_cache, tmp_path, path):
 
 def test_the_decoder_alone_is_exported(fitted_run, private_cache, tmp_path, capsys):
     path = tmp_path / "decoder.pt2"
-    assert main(["--run", str(fitted_run), "--export-decoder", str(path)]) == 0
+    assert main([str(fitted_run), "--export-decoder", str(path)]) == 0
     assert capsys.readouterr().out.strip() == str(path)
     from mitsuba_avatar.driving.decoder_export import example_inputs
     from mitsuba_avatar.training.run_folder import RunFolder
@@ -128,12 +128,12 @@ def test_the_decoder_alone_is_exported(fitted_run, private_cache, tmp_path, caps
     ],
 )
 def test_bad_input_is_one_line(fitted_run, private_cache, tmp_path, capsys, words, message):
-    assert main(["--run", str(fitted_run), "--out", str(tmp_path / "out"), *words]) == 2
+    assert main([str(fitted_run), "--out", str(tmp_path / "out"), *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("drive: ") and message in line
 
 
 def test_action_codes_cannot_drive_an_avatar_whose_rig_has_no_facial_actions(fitted_run, private_cache, tmp_path, capsys):
     (tmp_path / "codes.csv").write_text("jawOpen\n0.5\n0.1\n")
-    assert main(["--run", str(fitted_run), "--face", str(tmp_path / "codes.csv"), *SMALL, "--out", str(tmp_path / "out")]) == 2
+    assert main([str(fitted_run), "--face", str(tmp_path / "codes.csv"), *SMALL, "--out", str(tmp_path / "out")]) == 2
     assert "'small' has no facial actions that tie the two" in capsys.readouterr().err

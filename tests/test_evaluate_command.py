@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_evaluation_repeats_what_the_fit_measured(fitted_run, private_cache, tmp_path, capsys):
-    assert main([str(fitted_run), "--output", str(tmp_path / "metrics.json")]) == 0
+    assert main([str(fitted_run), "--out", str(tmp_path / "metrics.json")]) == 0
     again, first = load_metrics(tmp_path / "metrics.json"), load_metrics(fitted_run / "metrics.json")
     for method in METHODS:
         for split in ("train", "test"):
@@ -63,7 +63,7 @@ def lose_capture(run):
         (lambda run: None, ["--frames", "-1"], "expected --frames of at least 1"),
         (lambda run: None, ["--flicker-frames", "-2"], "expected --flicker-frames of 0 or more"),
         (lambda run: None, ["--checkpoint", "newest"], "expected checkpoint 'best' or 'last'; got 'newest'"),
-        (lambda run: None, ["--output", "/dev/null/metrics.json"], "got /dev/null, which is a file"),
+        (lambda run: None, ["--out", "/dev/null/metrics.json"], "got /dev/null, which is a file"),
         (lambda run: None, ["--variant", "scalar_rgb"], "scalar_rgb"),
     ],
 )
@@ -78,5 +78,5 @@ def test_bad_input_is_one_line(fitted_run, private_cache, tmp_path, capsys, dama
 def test_another_face_signal_is_refused(fitted_run, drawn_capture, private_cache, tmp_path, capsys):
     shutil.copytree(drawn_capture.path, tmp_path / "copy")
     np.save(tmp_path / "copy/face.npy", np.zeros((len(drawn_capture.frames), 5), np.float32))
-    assert main([str(fitted_run), "--capture", str(tmp_path / "copy"), "--output", str(tmp_path / "metrics.json")]) == 2
+    assert main([str(fitted_run), "--capture", str(tmp_path / "copy"), "--out", str(tmp_path / "metrics.json")]) == 2
     assert "expected a face signal of 3 numbers" in capsys.readouterr().err and not (tmp_path / "metrics.json").exists()

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_everything_at_once(fitted_run, private_cache, tmp_path, capsys):
     words = ("--format", "glb", "obj", "ply", "textures", "--split", "train", "--frames", "3", "--texture", "albedo")
-    assert main([str(fitted_run), *words, "--output", str(tmp_path / "out")]) == 0
+    assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
     out = capsys.readouterr().out
     assert "skinning with 4 joints a vertex: 0.00 mm" in out and out.rstrip().endswith(str(tmp_path / "out"))
     names = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*") if path.is_file()}
@@ -34,7 +34,7 @@ def test_everything_at_once(fitted_run, private_cache, tmp_path, capsys):
 
 
 def test_meshes_alone_need_no_texture(fitted_run, private_cache, tmp_path):
-    assert main([str(fitted_run), "--format", "ply", "--frames", "1", "--output", str(tmp_path / "out")]) == 0
+    assert main([str(fitted_run), "--format", "ply", "--frames", "1", "--out", str(tmp_path / "out")]) == 0
     assert [path.name for path in (tmp_path / "out").rglob("*.*")] == ["000028.ply"]
 
 
@@ -46,11 +46,11 @@ def test_meshes_alone_need_no_texture(fitted_run, private_cache, tmp_path):
         (["--face-shapes", "actions", "--format", "glb", "--frames", "1"], "'small' has none"),
         (["--pose-shapes", "-1"], "pose_shapes >= 0"),
         (["--texture", "albedo", "--captured-light", "moon"], "got 'moon'"),
-        (["--output", "/dev/null/out"], "got /dev/null, which is a file"),
+        (["--out", "/dev/null/out"], "got /dev/null, which is a file"),
     ],
 )
 def test_bad_input_is_one_line(fitted_run, private_cache, tmp_path, capsys, words, message):
-    output = () if "--output" in words else ("--output", str(tmp_path / "out"))
+    output = () if "--out" in words else ("--out", str(tmp_path / "out"))
     assert main([str(fitted_run), *words, *output]) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("export: ")]
     assert message in line

@@ -17,7 +17,7 @@ SHORT = ("--frames", "2", "--steps", "12", "--views-per-step", "3")
 
 def test_reconstruction_reports_errors_and_writes_what_drive_reads(fitted_run, private_cache, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["--run", str(fitted_run), *SHORT, "--out", str(out)]) == 0
+    assert main([str(fitted_run), *SHORT, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert all(f"{method} " in printed for method in METHODS) and printed.strip().endswith(str(out))
     report = json.loads((out / "reconstruction.json").read_text())
@@ -29,13 +29,13 @@ def test_reconstruction_reports_errors_and_writes_what_drive_reads(fitted_run, p
     codes = np.load(out / "z.npy")
     assert np.load(out / "theta.npy").shape == (2, 5) and codes.any() and np.load(out / "frames.npy").tolist() == [28, 29]
     words = ("--pose", str(out), "--latents", str(out / "z.npy"), "--width", "30", "--height", "44")
-    assert drive.main(["--run", str(fitted_run), *words, "--out", str(tmp_path / "again")]) == 0
+    assert drive.main([str(fitted_run), *words, "--out", str(tmp_path / "again")]) == 0
     assert json.loads((tmp_path / "again/drive.json").read_text())["frames"] == 2
 
 
 def test_a_second_call_keeps_what_is_done_and_does_the_rest(fitted_run, private_cache, tmp_path, capsys):
     out = tmp_path / "out"
-    words = ("--run", str(fitted_run), "--steps", "4", "--start", "previous", "--out", str(out))
+    words = (str(fitted_run), "--steps", "4", "--start", "previous", "--out", str(out))
     assert main([*words, "--frames", "1"]) == 0
     stamp = (out / "frames/000028.npz").stat().st_mtime_ns
     assert main([*words, "--frames", "2"]) == 0
@@ -59,7 +59,7 @@ def test_a_second_call_keeps_what_is_done_and_does_the_rest(fitted_run, private_
     ],
 )
 def test_bad_input_is_one_line(fitted_run, private_cache, tmp_path, capsys, words, message):
-    assert main(["--run", str(fitted_run), "--out", str(tmp_path / "out"), *words]) == 2
+    assert main([str(fitted_run), "--out", str(tmp_path / "out"), *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("reconstruct: ") and message in line
 
@@ -67,7 +67,7 @@ def test_bad_input_is_one_line(fitted_run, private_cache, tmp_path, capsys, word
 def test_a_mesh_that_is_not_there_is_named(fitted_run, drawn_capture, private_cache, tmp_path, capsys):
     shutil.copytree(drawn_capture.path, tmp_path / "copy")
     (tmp_path / "copy/vertices.npy").unlink()
-    words = ("--run", str(fitted_run), "--capture", str(tmp_path / "copy"), *SHORT)
+    words = (str(fitted_run), "--capture", str(tmp_path / "copy"), *SHORT)
     assert main([*words, "--mesh", "--out", str(tmp_path / "out")]) == 2
     assert "expected a registered mesh" in capsys.readouterr().err
     assert main([*words, "--out", str(tmp_path / "other")]) == 0, "images alone are enough"

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_held_out_cameras_as_pictures(fitted_run, private_cache, drawn_capture, tmp_path, capsys):
-    assert main([str(fitted_run), "--path", "held_out", "--frames", "2", "--output", str(tmp_path / "out")]) == 0
+    assert main([str(fitted_run), "--path", "held_out", "--frames", "2", "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").glob("*.png")) == [f"{HELD_OUT}_000028.png", f"{HELD_OUT}_000029.png"]
     for index in (8, 9):
@@ -33,7 +33,7 @@ def test_held_out_cameras_as_pictures(fitted_run, private_cache, drawn_capture, 
 
 def test_an_orbit_as_layers(fitted_run, private_cache, tmp_path):
     words = ("--format", "exr", "--frames", "3", "--width", "30", "--height", "44", "--split", "train")
-    assert main([str(fitted_run), *words, "--output", str(tmp_path / "out")]) == 0
+    assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
     paths = sorted((tmp_path / "out").glob("*.exr"))
     assert [path.name for path in paths] == ["orbit_0000_000020.exr", "orbit_0001_000022.exr", "orbit_0002_000025.exr"]
     layers = read_exr(paths[1])
@@ -51,7 +51,7 @@ def test_an_orbit_as_layers(fitted_run, private_cache, tmp_path):
 
 def test_posed_meshes(fitted_run, private_cache, tmp_path):
     words = ("--format", "ply", "--frames", "2", "--width", "30", "--height", "44", "--split", "train")
-    assert main([str(fitted_run), *words, "--output", str(tmp_path / "out")]) == 0
+    assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
     first, second = (trimesh.load(path, process=False) for path in sorted((tmp_path / "out").glob("*.ply")))
     assert first.vertices.shape == second.vertices.shape == (258, 3) and len(first.faces) > 400
     assert np.abs(first.vertices - second.vertices).max() > 1e-3
@@ -110,13 +110,13 @@ def test_held_out_cameras_of_several_sizes_cannot_share_a_film(fitted_run, drawn
     description.write_text(description.read_text().replace(f"- {HELD_OUT}", f"- {HELD_OUT}\n- front"))
     assert main([str(fitted_run), "--path", "held_out", "--capture", str(tmp_path / "copy")]) == 2
     assert "expected held-out cameras of one image size" in capsys.readouterr().err
-    words = ("--frames", "1", "--width", "30", "--height", "44", "--output", str(tmp_path / "out"))
+    words = ("--frames", "1", "--width", "30", "--height", "44", "--out", str(tmp_path / "out"))
     assert main([str(fitted_run), "--capture", str(tmp_path / "copy"), *words]) == 0
 
 
 def test_a_place_that_cannot_be_written_is_one_line(fitted_run, private_cache, tmp_path, capsys):
     (tmp_path / "file").write_text("not a folder")
-    assert main([str(fitted_run), "--frames", "1", "--output", str(tmp_path / "file/out")]) == 2
+    assert main([str(fitted_run), "--frames", "1", "--out", str(tmp_path / "file/out")]) == 2
     assert f"expected a folder at {tmp_path}/file/out; got {tmp_path}/file, which is a file" in capsys.readouterr().err
 
 
@@ -129,7 +129,7 @@ def test_a_picture_drawn_alone_has_the_same_bytes(fitted_run, private_cache, tmp
     """Also in another order: the last one first."""
     words = (str(fitted_run), "--path", "spiral", "--format", "exr", "png", "--frames", "3", *SMALL[2:], *scene)
     for part in ((), ("--only", "2"), ("--shard", "0/1")):
-        assert main([*words, *part, "--output", str(tmp_path / ("all" if not part else "parts"))]) == 0
+        assert main([*words, *part, "--out", str(tmp_path / ("all" if not part else "parts"))]) == 0
     names = sorted(path.name for path in (tmp_path / "all").iterdir())
     assert len(names) == 7 and names == sorted(path.name for path in (tmp_path / "parts").iterdir())
     for name in names:
@@ -137,7 +137,7 @@ def test_a_picture_drawn_alone_has_the_same_bytes(fitted_run, private_cache, tmp
 
 
 def test_what_exists_is_kept_and_other_settings_are_refused(fitted_run, private_cache, tmp_path, capsys):
-    words = (str(fitted_run), *SMALL, "--output", str(tmp_path / "out"))
+    words = (str(fitted_run), *SMALL, "--out", str(tmp_path / "out"))
     assert main([*words]) == 0
     paths = sorted((tmp_path / "out").glob("*.png"))
     paths[1].unlink()
@@ -153,7 +153,7 @@ def test_relit_from_the_side_the_lamps_are_on(fitted_run, private_cache, tmp_pat
     means = {}
     for path, light in (("orbit", "relit"), ("orbit", "baked"), ("turntable", "relit")):
         out = tmp_path / path / light
-        words = ("--path", path, "--light", light, "--hold", "24", "--format", "exr", *IN_A_SCENE, *SMALL, "--output", str(out))
+        words = ("--path", path, "--light", light, "--hold", "24", "--format", "exr", *IN_A_SCENE, *SMALL, "--out", str(out))
         assert main([str(fitted_run), *words]) == 0
         colours = [read_exr(file)["colour"] for file in sorted(out.glob("*.exr"))]
         means[path, light] = [float(colour[colour[..., 3] == 1][:, :3].mean()) for colour in colours]
@@ -163,7 +163,7 @@ def test_relit_from_the_side_the_lamps_are_on(fitted_run, private_cache, tmp_pat
 
 
 def test_a_time_budget_is_settled_once(fitted_run, private_cache, tmp_path):
-    words = (str(fitted_run), *SMALL, "--scene", "dome", "--light", "baked", "--seconds", "0.05", "--output", str(tmp_path / "out"))
+    words = (str(fitted_run), *SMALL, "--scene", "dome", "--light", "baked", "--seconds", "0.05", "--out", str(tmp_path / "out"))
     assert main([*words, "--only", "0"]) == 0
     settled = json.loads((tmp_path / "out/render.json").read_text())["settled"]
     assert settled["samples"] % 16 == 0 and settled["samples"] > 0
@@ -173,19 +173,19 @@ def test_a_time_budget_is_settled_once(fitted_run, private_cache, tmp_path):
 
 def test_cameras_and_key_frames_of_files(fitted_run, private_cache, drawn_capture, tmp_path):
     cameras = ("--path", "cameras", "--file", str(drawn_capture.path / "cameras.json"), "--frames", "2", "--play", "22")
-    assert main([str(fitted_run), *cameras, "--output", str(tmp_path / "cameras")]) == 0
+    assert main([str(fitted_run), *cameras, "--out", str(tmp_path / "cameras")]) == 0
     assert sorted(path.name for path in (tmp_path / "cameras").glob("*.png")) == ["front_000022.png", "right_000023.png"]
     key = "{time: 0, position: [0, -2, 0.5], target: [0, 0, 0.3], field_of_view: 30}"
     (tmp_path / "keys.yaml").write_text(f"keyframes: [{key}]")
     keys = ("--path", "keyframes", "--file", str(tmp_path / "keys.yaml"), "--backdrop", "None", "--frames", "1", *SMALL[2:])
-    assert main([str(fitted_run), *keys, "--output", str(tmp_path / "keys")]) == 0
+    assert main([str(fitted_run), *keys, "--out", str(tmp_path / "keys")]) == 0
     with Image.open(tmp_path / "keys/keyed_0000_000028.png") as picture:
         alpha = np.asarray(picture)[..., 3]
     assert alpha.shape == (44, 30) and alpha.max() == 255 and alpha.min() == 0
 
 
 def test_a_video_waits_for_the_other_shard(fitted_run, private_cache, tmp_path, capsys):
-    words = (str(fitted_run), "--format", "mp4", *SMALL, "--output", str(tmp_path / "out"))
+    words = (str(fitted_run), "--format", "mp4", *SMALL, "--out", str(tmp_path / "out"))
     assert main([*words, "--shard", "1/2"]) == 0
     assert "waits for 2 pictures" in capsys.readouterr().err and not (tmp_path / "out.mp4").exists()
     assert main([*words, "--shard", "0/2"]) == 0 and (tmp_path / "out.mp4").exists()

@@ -27,7 +27,7 @@ def reported(fitted_run, session_cache, tmp_path_factory):
         for ending in ("json", "csv"):
             shutil.copy(folder / f"first/metrics.{ending}", folder / f"second/metrics.{ending}")
         assert main([str(folder / "first"), "--views", "2"]) == 0
-        assert main([str(folder / "first"), str(folder / "second"), "--views", "1", "--output", str(folder / "both")]) == 0
+        assert main([str(folder / "first"), str(folder / "second"), "--views", "1", "--out", str(folder / "both")]) == 0
     return folder
 
 
@@ -84,7 +84,7 @@ def test_two_runs_stand_side_by_side(reported):
 
 def test_what_was_not_evaluated_is_measured(fitted_run, tmp_path):
     run = shutil.copytree(fitted_run, tmp_path / "run")
-    assert main([str(run), "--frames", "1", "--views", "1", "--output", str(tmp_path / "out")]) == 0
+    assert main([str(run), "--frames", "1", "--views", "1", "--out", str(tmp_path / "out")]) == 0
     columns = rows_of(tmp_path / "out/pictures.csv")[0]
     assert {"box_flip", "seam", "flicker"} <= set(columns)
     assert not (run / "metrics.csv").exists(), "the run itself is left alone"
@@ -94,7 +94,7 @@ def test_what_was_not_evaluated_is_measured(fitted_run, tmp_path):
     ("words", "message"),
     [
         (["--views", "0"], "expected --views and --frames of at least 1; got 0 and 4"),
-        (["--output", "/dev/null/report"], "got /dev/null, which is a file"),
+        (["--out", "/dev/null/report"], "got /dev/null, which is a file"),
         (["--capture", "/nowhere"], "/nowhere; got none"),
     ],
 )
@@ -110,5 +110,5 @@ def test_a_folder_without_a_run_is_one_line(tmp_path, capsys):
 
 
 def test_the_same_run_twice_is_refused(reported, capsys):
-    assert main([str(reported / "first"), str(reported / "first"), "--output", str(reported / "twice")]) == 2
+    assert main([str(reported / "first"), str(reported / "first"), "--out", str(reported / "twice")]) == 2
     assert "expected runs of different names" in capsys.readouterr().err

@@ -33,7 +33,7 @@ def run_workers(planned: list[PlannedRun], jobs: int, progress: Callable[[int, i
         RuntimeError: a worker failed; the others are interrupted and have saved their checkpoints. The message ends with its log.
         KeyboardInterrupt: Ctrl-C or SIGTERM; after all workers have saved.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended from outside, workers must not go on unseen
+    previous = signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended from outside, workers must not go on unseen
     waiting = [run for run in planned if not run.is_measured]
     total = sum(run.settings.training.iterations for run in planned)
     workers: dict[subprocess.Popen, PlannedRun] = {}
@@ -50,6 +50,7 @@ def run_workers(planned: list[PlannedRun], jobs: int, progress: Callable[[int, i
             progress(sum(run.iterations_done() for run in planned), total)
     finally:
         _stop(list(workers))
+        signal.signal(signal.SIGTERM, previous)
 
 
 def default_jobs() -> int:

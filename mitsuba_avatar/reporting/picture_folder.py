@@ -47,7 +47,7 @@ class PictureFolder:
             if stored.get(key) != self._settings.get(key):
                 raise ValueError(
                     f"PictureFolder(): expected pictures with {key} = {stored.get(key)!r}, as {path} has them; got "
-                    f"{self._settings.get(key)!r}. Draw into another --output, or use --overwrite."
+                    f"{self._settings.get(key)!r}. Draw into another --out, or use --overwrite."
                 )
 
     def settle(self, find_out: Callable[[], dict[str, Any]]) -> dict[str, Any]:

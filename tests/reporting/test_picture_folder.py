@@ -30,7 +30,7 @@ def test_the_first_process_settles_for_all(tmp_path):
 def test_pictures_of_other_settings_do_not_mix(tmp_path):
     PictureFolder(tmp_path / "out", SETTINGS).settle(dict)
     changed = SETTINGS | {"samples": 32}
-    with pytest.raises(ValueError, match="expected pictures with samples = 16, .* got 32. Draw into another --output"):
+    with pytest.raises(ValueError, match="expected pictures with samples = 16, .* got 32. Draw into another --out"):
         PictureFolder(tmp_path / "out", changed)
     PictureFolder(tmp_path / "out", changed, is_overwritten=True).settle(dict)
     assert json.loads((tmp_path / "out" / SETTINGS_FILE).read_text())["settings"]["samples"] == 32
