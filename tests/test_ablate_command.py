@@ -57,6 +57,7 @@ def test_rows_are_trained_measured_and_tabled_once(drawn_capture, tmp_path: Path
     assert (tmp_path / "out" / "ours" / "seed_0" / "measures.json").stat().st_mtime_ns == made
 
 
+@pytest.mark.slow
 def test_a_rehearsal_learns_from_meshes_alone(drawn_capture, tmp_path: Path, private_cache):
     words = ["--capture", str(drawn_capture.path), "--out", str(tmp_path), "--rows", "pose_face", "--rehearsal", *SMALL, *SHORT]
     assert main([word for word in words if "views_per_pose" not in word]) == 0
@@ -64,6 +65,7 @@ def test_a_rehearsal_learns_from_meshes_alone(drawn_capture, tmp_path: Path, pri
     assert "images" not in row["measures"] and row["test"] == row["measures"]["geometry"]["test"]["driven_mm"] > 0
 
 
+@pytest.mark.slow
 def test_a_worker_that_fails_is_told_with_its_log(drawn_capture, tmp_path: Path, private_cache, capsys: pytest.CaptureFixture):
     words = [
         "--capture",
@@ -81,6 +83,7 @@ def test_a_worker_that_fails_is_told_with_its_log(drawn_capture, tmp_path: Path,
     assert "seed_0 ended with status" in told and "views_per_pose" in told
 
 
+@pytest.mark.slow
 def test_workers_save_and_end_when_the_command_is_ended(drawn_capture, tmp_path: Path, private_cache):
     words = [
         "--capture",
