@@ -15,7 +15,6 @@ from torch import Tensor
 from mitsuba_avatar.analysis.regions import with_surroundings
 from mitsuba_avatar.body.driving import driving_regions
 from mitsuba_avatar.body.rig import Rig
-from mitsuba_avatar.body.skinning import pose_vertices
 from mitsuba_avatar.captures.arrays import open_frame_array
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.filming.truth import GARMENT, TRUTH_FOLDER
@@ -137,6 +136,12 @@ class Study:
         mask[self.garment] = True
         return {"garment": mask}
 
+    @torch.no_grad()
+    def surface(self, frame: int, z: Float[Tensor, "1 Z"] | None) -> Float[np.ndarray, "V 3"]:
+        """Surface decoded for a frame's driving signal in the world, metres; None is the most likely code."""
+        row = self.drive.rows(slice(frame, frame + 1))
+        return self.avatar.decode_vertices(row.theta, row.root, row.face, z)[0].numpy()
+
     def keypoints(self) -> DrivenKeypoints:
         """What the driving signal fixes."""
         with_face = lists_face_landmarks(self.rig, self.capture.description.face_signal, self.drive.face.shape[1])
@@ -155,9 +160,8 @@ def geometry_errors(study: Study, most: int) -> dict[str, dict[str, float]]:
     for split, frames in Splits.of(study.capture, most).frames.items():
         sums: dict[str, list[float]] = {}
         for frame in frames:
-            part = study.drive.rows(slice(frame, frame + 1))
             registered, decoded = surface_distances(study, frame)
-            distances = {"registered": registered, "driven": _distance(study, frame, _posed(study.avatar, part, None))}
+            distances = {"registered": registered, "driven": _distance(study, frame, study.surface(frame, None))}
             for name, distance in (distances | ({} if study.posterior is None else {"decoded": decoded})).items():
                 for suffix, mask in masks.items():
                     sums.setdefault(f"{name}{suffix}_mm", []).append(float(distance[mask].mean()))
@@ -169,10 +173,9 @@ def geometry_errors(study: Study, most: int) -> dict[str, dict[str, float]]:
 def surface_distances(study: Study, frame: int) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:  # noqa: F821
     """Distance of each vertex from the true surface's, millimetres: of the registered mesh, and of the mesh decoded from the frame's own
     latent code (z = 0 for an avatar without one)."""
-    row = slice(frame, frame + 1)
-    z = None if study.posterior is None else study.posterior.mu[row]
+    z = None if study.posterior is None else study.posterior.mu[frame : frame + 1]
     registered = np.asarray(study.capture.vertices[frame])
-    return _distance(study, frame, registered), _distance(study, frame, _posed(study.avatar, study.drive.rows(row), z))
+    return _distance(study, frame, registered), _distance(study, frame, study.surface(frame, z))
 
 
 def disentanglement(study: Study, seed: int = 0) -> dict:
@@ -270,9 +273,3 @@ def _encoded(avatar: Avatar, capture: Capture, drive: Drive) -> Posterior | None
 def _distance(study: Study, frame: int, surface: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:  # noqa: F821
     """Of each vertex from where it truly is, millimetres."""
     return MILLIMETRES * np.linalg.norm(surface.astype(np.float64) - study.exact[frame], axis=-1)
-
-
-def _posed(avatar: Avatar, drive: Drive, z: Tensor | None) -> Float[np.ndarray, "V 3"]:
-    """Decoded surface of one frame in the world, metres."""
-    rest = avatar.decode_rest_vertices(drive.theta, drive.face, z)
-    return pose_vertices(rest, avatar.skeleton(drive.theta, drive.root), avatar.skinning_weights)[0].numpy()

@@ -17,7 +17,6 @@ from torch import Tensor
 from mitsuba_avatar.analysis.effects import Effect, shape_uncertainty, texture_uncertainty
 from mitsuba_avatar.analysis.measures import Study, surface_distances
 from mitsuba_avatar.body.mesh import vertex_normals
-from mitsuba_avatar.body.skinning import pose_vertices
 from mitsuba_avatar.body.uv import UvAtlas
 from mitsuba_avatar.captures.cameras import Camera
 from mitsuba_avatar.captures.colour import decode, encode
@@ -116,7 +115,7 @@ def save_uncertainty(
 ) -> None:
     """Spread over codes drawn from the prior, of shape and of texture, for three test frames."""
     frames = _some(study, 3)
-    posed = [_driven(study, frame) for frame in frames]
+    posed = [torch.from_numpy(study.surface(frame, None)) for frame in frames]
     shapes = [Painted(f"frame {frame}", shape_uncertainty(study, frame), body) for frame, body in zip(frames, posed, strict=True)]
     painter.save(shape_path, "Spread of the shape over codes drawn from the prior", "mm", [shapes])
     textures = []
@@ -140,14 +139,6 @@ def save_geometry_gain(path: Path | str, study: Study, painter: FieldPainter) ->
 def _some(study: Study, count: int, split: str = "test") -> list[int]:
     frames = study.frames(split) or study.frames("train")
     return [frames[(2 * i + 1) * len(frames) // (2 * count)] for i in range(count)]
-
-
-@torch.no_grad()
-def _driven(study: Study, frame: int) -> Float[Tensor, "V 3"]:
-    """Surface of a frame driven with z = 0, world."""
-    row = study.drive.rows(slice(frame, frame + 1))
-    rest = study.avatar.decode_rest_vertices(row.theta, row.face, None)
-    return pose_vertices(rest, study.avatar.skeleton(row.theta, row.root), study.avatar.skinning_weights)[0]
 
 
 def _front_and_back(vertices: Float[Tensor, "V 3"]) -> list[Camera]:

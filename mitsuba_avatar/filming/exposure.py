@@ -2,7 +2,6 @@
 
 Rays are made here and not by Mitsuba's film, for three reasons: pixels that cannot see the person cost nothing (six in seven of a
 full-body portrait), sums have a fixed order, so that the same seed gives the same bits, and memory is bounded at any image size.
-Every camera goes through the same kernel: intrinsics and pose are values, not constants of the code.
 
 Symbols: P pixels, S samples a pixel, L = P * S lanes of a launch. Pixels and metres.
 """
@@ -15,9 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from mitsuba_avatar.captures.cameras import Camera
-
-LARGEST_LAUNCH = 1 << 22  # lanes; 2 GB of memory at most, far above where launches cost time
-NEAR = 0.05  # metres; a vertex nearer to the camera's plane has no box in the image
+from mitsuba_avatar.rendering.camera_rays import LARGEST_LAUNCH, NEAR, camera_row, jittered_rays
 
 
 class Exposure:
@@ -41,7 +38,7 @@ class Exposure:
         """
         chosen = np.flatnonzero(pixels)
         at_once = max(1, LARGEST_LAUNCH // self.samples)
-        row = _camera_row(camera)
+        row = camera_row(camera)
         chunks = [chosen[start : start + at_once] for start in range(0, len(chosen), at_once)]
         seeds = np.random.SeedSequence(seed).generate_state(len(chunks)) if chunks else ()
         parts = [(chunk, self._trace(row, camera.width, chunk, int(chunk_seed))) for chunk, chunk_seed in zip(chunks, seeds, strict=True)]
@@ -49,21 +46,8 @@ class Exposure:
 
     def _trace(self, row: list, width: int, pixels: Int[np.ndarray, "P"], seed: int) -> list:
         """One launch: red, green, blue and coverage of pixels."""
-        count = len(pixels) * self.samples
-        sampler = self._sampler
-        # Opaque: a literal seed or width would be compiled into the kernel.
-        sampler.seed(dr.opaque(mi.UInt32, seed), count)
-        pixel = dr.gather(mi.UInt32, _upload(pixels), dr.arange(mi.UInt32, count) // self.samples)
-        columns = dr.opaque(mi.UInt32, width)
-        y = pixel // columns
-        x = pixel - y * columns
-        focal_x, focal_y, principal_x, principal_y, *pose = row
-        jitter = sampler.next_2d()
-        right = (mi.Float(x) + jitter.x - principal_x) / focal_x
-        down = (mi.Float(y) + jitter.y - principal_y) / focal_y
-        direction = mi.Vector3f(*(pose[axis] * right + pose[3 + axis] * down + pose[6 + axis] for axis in range(3)))
-        ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(*pose[9:]), dr.normalize(direction)))
-        radiance, valid, _ = self.integrator.sample(self.scene, sampler, ray)
+        ray = jittered_rays(row, width, pixels, self.samples, self._sampler, seed)
+        radiance, valid, _ = self.integrator.sample(self.scene, self._sampler, ray)
         lit = dr.select(valid, radiance, 0)
         channels = [lit.x, lit.y, lit.z, dr.select(valid, mi.Float(1), 0)]
         dr.eval(channels)  # or each of the sums would trace all paths for itself
@@ -107,18 +91,3 @@ def visible_pixels(camera: Camera, vertices: Float[np.ndarray, "V 3"], faces: In
         counts += sign * np.bincount(y * (width + 1) + x, minlength=len(counts))
     grid = counts.reshape(height + 1, width + 1)
     return (grid.cumsum(axis=0).cumsum(axis=1) > 0)[:height, :width]
-
-
-def _camera_row(camera: Camera) -> list:
-    """Intrinsics, then the rows right, down, forward and the centre of the camera in the world, as values that kernels do not contain."""
-    pose = camera.world_from_camera
-    values = [camera.fx, camera.fy, camera.cx, camera.cy, *pose[:3, 0], *pose[:3, 1], *pose[:3, 2], *pose[:3, 3]]
-    return [dr.opaque(mi.Float, float(value)) for value in values]
-
-
-def _upload(indices: Int[np.ndarray, "P"]) -> "mi.UInt32":
-    """Indices in memory that Dr.Jit allocated: numpy's own has an alignment that varies, and with it the kernel."""
-    padded = mi.UInt32(np.ascontiguousarray(indices, dtype=np.uint32))
-    uploaded = padded + dr.opaque(mi.UInt32, 0)
-    dr.eval(uploaded)
-    return uploaded

@@ -201,6 +201,12 @@ class Avatar(nn.Module):
         z = self._latent(z, len(theta))
         return self._displaced(self.decoder.displacement(self.standardize_theta(theta), self.standardize_face(face), z))
 
+    def decode_vertices(
+        self, theta: Float[Tensor, "P D"], root: Float[Tensor, "P 4 4"], face: Float[Tensor, "P F"], z: Float[Tensor, "P Z"] | None
+    ) -> Float[Tensor, "P V 3"]:
+        """The `vertices` of `decode` alone: posed in the world, metres; arguments, gradients and errors as there."""
+        return pose_vertices(self.decode_rest_vertices(theta, face, z), self.skeleton(theta, root), self.skinning_weights)
+
     def standardized_driving(self, theta: Float[Tensor, "P D"], face: Float[Tensor, "P F"]) -> Float[Tensor, "P DF"]:
         """The driving signal as one vector c = (theta, face), each in its own unit of deviation."""
         return torch.cat([self.standardize_theta(theta), self.standardize_face(face)], dim=1)
@@ -241,8 +247,7 @@ class Avatar(nn.Module):
     ) -> tuple[Float[Tensor, "P V 3"], Posterior | None]:
         """The posed surface and the posterior of `forward` alone, without cameras, occlusion or texture; arguments and errors as there."""
         z, posterior = self._draw_latent(registered_vertices, theta, root, noise)
-        rest_vertices = self.decode_rest_vertices(theta, face, z)
-        return pose_vertices(rest_vertices, self.skeleton(theta, root), self.skinning_weights), posterior
+        return self.decode_vertices(theta, root, face, z), posterior
 
     def _draw_latent(
         self, registered_vertices: Tensor | None, theta: Tensor, root: Tensor, noise: Tensor | None

@@ -17,13 +17,12 @@ from jaxtyping import Bool, Float, Float32
 
 from mitsuba_avatar.captures.cameras import Camera
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
+from mitsuba_avatar.rendering.camera_rays import LARGEST_LAUNCH, NEAR, camera_row, jittered_rays
 from mitsuba_avatar.rendering.lit_scene import LitScene
 
 SAMPLES_PER_PASS = 16  # a 4x4 grid that the sampler stratifies
 FEWEST_PASSES = 4  # before their spread is believed
 MOST_SAMPLES = 1 << 16  # where a noise budget gives up
-LARGEST_LAUNCH = 1 << 22  # lanes; bounds memory to about 2 GB
-NEAR = 0.05  # metres; a vertex nearer to the camera's plane has no place in the image
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 
 
@@ -97,7 +96,7 @@ class PathTracer:
         if camera.is_distorted:
             raise ValueError(f"draw(): expected a pinhole camera; {camera.name!r} has distortion. Set it to zero for novel views.")
         pixels = np.ones((camera.height, camera.width), bool) if self.lit.has_objects else _surroundings(camera, vertices)
-        chosen, row = np.flatnonzero(pixels), _camera_row(camera)
+        chosen, row = np.flatnonzero(pixels), camera_row(camera)
         total, squares, passes, noise = np.zeros((len(chosen), 4)), np.zeros(len(chosen)), 0, math.inf
         while passes < budget.most_passes:
             mean = self._pass(row, camera.width, chosen, np.random.SeedSequence((seed, passes)))
@@ -133,21 +132,8 @@ class PathTracer:
         import drjit as dr
 
         mi = loaded_mitsuba()
-        count, sampler, scene = len(chosen) * SAMPLES_PER_PASS, self._sampler, self.lit.scene
-        sampler.seed(dr.opaque(mi.UInt32, seed), count)  # opaque: a literal would be compiled into the kernel
-        # A sum with an opaque zero, for memory that Dr.Jit allocated: numpy's alignment varies, and with it the kernel.
-        indices = mi.UInt32(np.ascontiguousarray(chosen, dtype=np.uint32)) + dr.opaque(mi.UInt32, 0)
-        dr.eval(indices)
-        pixel = dr.gather(mi.UInt32, indices, dr.arange(mi.UInt32, count) // SAMPLES_PER_PASS)
-        columns = dr.opaque(mi.UInt32, width)
-        y = pixel // columns
-        x = pixel - y * columns
-        focal_x, focal_y, principal_x, principal_y, *pose = row
-        jitter = sampler.next_2d()
-        right = (mi.Float(x) + jitter.x - principal_x) / focal_x
-        down = (mi.Float(y) + jitter.y - principal_y) / focal_y
-        direction = mi.Vector3f(*(pose[axis] * right + pose[3 + axis] * down + pose[6 + axis] for axis in range(3)))
-        ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(*pose[9:]), dr.normalize(direction)))
+        sampler, scene = self._sampler, self.lit.scene
+        ray = jittered_rays(row, width, chosen, SAMPLES_PER_PASS, sampler, seed)
         # Asked here and not of the integrator, which has no way to show emitting surfaces and hide light from far away.
         hit = scene.ray_intersect(ray)
         is_seen = hit.is_valid()
@@ -184,13 +170,3 @@ def _surroundings(camera: Camera, vertices: Float[np.ndarray, "V 3"]) -> Bool[np
     right, bottom = np.floor(pixels.max(axis=0)).astype(int) + 2
     box[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = True
     return box
-
-
-def _camera_row(camera: Camera) -> list:
-    """Intrinsics, then the rows right, down, forward and the centre of the camera in the world, as values that kernels do not contain."""
-    import drjit as dr
-
-    mi = loaded_mitsuba()
-    pose = camera.world_from_camera
-    values = [camera.fx, camera.fy, camera.cx, camera.cy, *pose[:3, 0], *pose[:3, 1], *pose[:3, 2], *pose[:3, 3]]
-    return [dr.opaque(mi.Float, float(value)) for value in values]
