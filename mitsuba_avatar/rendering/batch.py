@@ -2,21 +2,26 @@
 
 from dataclasses import dataclass
 
-from mitsuba_avatar.rendering.scene import MeshScene
+from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.surface_tables import SurfaceTables
 
 
 @dataclass
-class ViewBounds:
-    """Where a batch's views can show anything.
+class FaceGrid:
+    """Which faces each cell, a small square of pixels of one view, may show.
 
     Attributes:
-        tiles: [T] indices of pixel tiles among those of all films, row by row, view after view.
-        depth_limit: [B] metres; nothing of a view's mesh lies farther away.
+        cell: pixels on a side; across, down: cells of one film.
+        count: [B * down * across] faces of each cell; end: where in `faces` those of a cell end.
+        faces: indices into the topology's faces, cell after cell.
     """
 
-    tiles: object
-    depth_limit: object
+    cell: int
+    across: int
+    down: int
+    count: object
+    end: object
+    faces: object
 
 
 @dataclass
@@ -24,7 +29,6 @@ class SurfaceBatch:
     """B views of P meshes.
 
     Attributes:
-        scene: the merged meshes in scene coordinates, for rays.
         vertices: packets [P * V, 4], local coordinates in metres (see `views` for the frames).
         textures: packets [B * h * w, 4], linear radiance, one texture a view.
         views: flat table of camera rows (`views.place`).
@@ -32,27 +36,27 @@ class SurfaceBatch:
         texture_size: (h, w) texels.
         film: (width, height) pixels.
         seed, seed_gradient: opaque UInt32, decorrelated.
-        bounds: filled once the vertices are projected.
+        triangles, front: what `facing` finds.
+        points, grid: what `face_grid` finds; grid is None where no view shows a face.
     """
 
-    scene: MeshScene
     tables: SurfaceTables
     vertices: object
     textures: object
     views: object
     centers: object
+    num_meshes: int
+    num_vertices: int
     num_views: int
     texture_size: tuple[int, int]
     film: tuple[int, int]
     samples_per_pixel: int
     seed: object
     seed_gradient: object
-    bounds: ViewBounds | None = None
-
-    @property
-    def num_vertices(self) -> int:
-        """V of one mesh."""
-        return self.scene.num_vertices
+    triangles: object = None
+    front: object = None
+    points: object = None
+    grid: FaceGrid | None = None
 
     @property
     def num_pixels(self) -> int:
@@ -63,3 +67,27 @@ class SurfaceBatch:
     def num_texels(self) -> int:
         """Texels of all textures together."""
         return self.num_views * self.texture_size[0] * self.texture_size[1]
+
+    def mesh_of(self, view_index):
+        """Which mesh (UInt32) a view shows; a literal where there is but one, so that kernels do not look it up."""
+        import drjit as dr
+
+        mi = loaded_mitsuba()
+        return mi.UInt32(0) if self.num_meshes == 1 else mi.UInt32(dr.gather(mi.Float, self.centers, view_index * 4 + 3))
+
+    def vertex(self, packet_index):
+        """Local position (Vector3f) of a vertex; packet_index is mesh * V + vertex."""
+        return packet_vector(self.vertices, packet_index)
+
+    def point(self, view_index, vertex):
+        """Position (Vector3f) of vertex 0..V-1 of a view's mesh in the view's camera axes."""
+        return packet_vector(self.points, view_index * self.num_vertices + vertex)
+
+
+def packet_vector(packets, index):
+    """First three numbers (Vector3f) of packets [N, 4]."""
+    import drjit as dr
+
+    mi = loaded_mitsuba()
+    packet = dr.gather(mi.Vector4f, packets, index)
+    return mi.Vector3f(packet.x, packet.y, packet.z)

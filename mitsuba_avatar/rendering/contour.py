@@ -16,12 +16,13 @@ importance-sampled.
 from dataclasses import dataclass
 
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
-from mitsuba_avatar.rendering.batch import SurfaceBatch
+from mitsuba_avatar.rendering.batch import SurfaceBatch, packet_vector
+from mitsuba_avatar.rendering.facing import VIEWS_PER_WORD, Triangle, num_words
 from mitsuba_avatar.rendering.shading import AdjointImage, interpolated_uv
 from mitsuba_avatar.rendering.surface_tables import NO_FACE
 from mitsuba_avatar.rendering.texture_lookup import Footprint
 from mitsuba_avatar.rendering.views import NEAR, View
-from mitsuba_avatar.rendering.visibility import TEA_ROUNDS
+from mitsuba_avatar.rendering.visibility import TEA_ROUNDS, nearest_face
 
 # Distance between an edge and the ray that looks past it, as a share of the film's longer side. It must be far below a triangle's size:
 # smooth surfaces have clusters of near-contour edges that hide each other by fractions of a pixel, and a ray that steps over the hiding
@@ -29,45 +30,7 @@ from mitsuba_avatar.rendering.visibility import TEA_ROUNDS
 # above float32 rounding of pixel positions, 6e-8 of the same length: with 1e-7 rays hit the face that they should pass.
 OUTSIDE = 4e-7
 MOST_SAMPLES = 32.0  # times the average, on one edge: one across the whole film must not outweigh a mesh of tiny ones
-VIEWS_PER_WORD = 32  # bits of an integer
 DEPTH_TOLERANCE = 1e-5  # relative; a hit this close in depth is the surface beside the edge, not an occluder
-
-
-def face_planes(batch: SurfaceBatch):
-    """Packets [P * F, 4]: normal (not normalised) and offset of every face's plane; a point x is in front where n . x > offset."""
-    import drjit as dr
-
-    mi = loaded_mitsuba()
-    tables, vertices = batch.tables, batch.vertices
-    num_planes = batch.scene.num_meshes * tables.num_faces
-    lane = dr.arange(mi.UInt32, num_planes)
-    base = lane // tables.num_faces * batch.num_vertices
-    corners = dr.gather(mi.Vector4u, tables.faces, lane % tables.num_faces)
-    v0, v1, v2 = (_vertex(vertices, base + corner) for corner in (corners.x, corners.y, corners.z))
-    normal = dr.cross(v1 - v0, v2 - v0)
-    planes = dr.zeros(mi.Float, num_planes * 4)
-    dr.scatter(planes, mi.Vector4f(normal.x, normal.y, normal.z, dr.dot(normal, v0)), lane)
-    return planes
-
-
-def views_from_front(batch: SurfaceBatch, planes):
-    """Bits [words * P * F]: bit k of word w says whether view 32 w + k looks at the face's mesh and sees the face from the front."""
-    import drjit as dr
-
-    mi = loaded_mitsuba()
-    num_planes = batch.scene.num_meshes * batch.tables.num_faces
-    lane = dr.arange(mi.UInt32, _num_words(batch) * num_planes)
-    word = lane // num_planes
-    plane_index = lane - word * num_planes
-    plane = dr.gather(mi.Vector4f, planes, plane_index)
-    mesh = mi.Float(plane_index // batch.tables.num_faces)
-    bits = mi.UInt32(0)
-    for k in range(min(VIEWS_PER_WORD, batch.num_views)):
-        view = word * VIEWS_PER_WORD + k
-        center = dr.gather(mi.Vector4f, batch.centers, view, view < batch.num_views)
-        bits |= dr.select((view < batch.num_views) & (center.w == mesh) & (_height(plane, center) > 0), mi.UInt32(1 << k), 0)
-    dr.eval(bits)
-    return bits
 
 
 @dataclass(frozen=True)
@@ -84,7 +47,7 @@ class EdgeViews:
     is_boundary: object
 
 
-def edge_views(batch: SurfaceBatch, planes) -> EdgeViews:
+def edge_views(batch: SurfaceBatch) -> EdgeViews:
     """Classify the edges for all views at once.
 
     A contour lies between a front and a back face. Where it is concave, the back face lies before the front face: the edge hides
@@ -94,19 +57,18 @@ def edge_views(batch: SurfaceBatch, planes) -> EdgeViews:
 
     mi = loaded_mitsuba()
     tables = batch.tables
-    front = views_from_front(batch, planes)
-    num_edges, num_planes = batch.scene.num_meshes * tables.num_edges, batch.scene.num_meshes * tables.num_faces
-    lane = dr.arange(mi.UInt32, _num_words(batch) * num_edges)
+    num_edges, num_triangles = batch.num_meshes * tables.num_edges, batch.num_meshes * tables.num_faces
+    lane = dr.arange(mi.UInt32, num_words(batch) * num_edges)
     word = lane // num_edges
     mesh = (lane - word * num_edges) // tables.num_edges
     edge_index = lane - word * num_edges - mesh * tables.num_edges
     edge = dr.gather(mi.Vector4u, tables.edges, edge_index)
     is_open = edge.w == NO_FACE
     faces = mesh * tables.num_faces
-    first = dr.gather(mi.UInt32, front, word * num_planes + faces + edge.z)
-    second = dr.gather(mi.UInt32, front, word * num_planes + faces + edge.w, ~is_open)
-    opposite = _vertex(batch.vertices, mesh * batch.num_vertices + dr.gather(mi.UInt32, tables.edge_opposite, edge_index))
-    is_convex = _height(dr.gather(mi.Vector4f, planes, faces + edge.z), opposite) < 0
+    first = dr.gather(mi.UInt32, batch.front, word * num_triangles + faces + edge.z)
+    second = dr.gather(mi.UInt32, batch.front, word * num_triangles + faces + edge.w, ~is_open)
+    opposite = batch.vertex(mesh * batch.num_vertices + dr.gather(mi.UInt32, tables.edge_opposite, edge_index))
+    is_convex = Triangle.gather(batch.triangles, faces + edge.z).height(opposite) < 0
     seam = dr.select(edge_index < tables.num_seams, first & second, 0)
     silhouette = dr.select(is_convex, first ^ second, 0)
     boundary = dr.select(is_open, mi.UInt32(0xFFFFFFFF), silhouette | seam)
@@ -114,15 +76,15 @@ def edge_views(batch: SurfaceBatch, planes) -> EdgeViews:
     for k in range(min(VIEWS_PER_WORD, batch.num_views)):
         view = word * VIEWS_PER_WORD + k
         is_own = view < batch.num_views
-        if batch.scene.num_meshes > 1:
-            is_own &= mi.UInt32(dr.gather(mi.Float, batch.centers, view * 4 + 3, is_own)) == mesh
+        if batch.num_meshes > 1:
+            is_own &= batch.mesh_of(dr.minimum(view, batch.num_views - 1)) == mesh
         # Scattered from here, since a kernel that reads little but by index has costs of its own.
         dr.scatter(is_boundary, (boundary >> k) & 1 == 1, view * tables.num_edges + edge_index, is_own, mode=dr.ReduceMode.NoConflicts)
     dr.eval(first, seam, is_boundary)
     return EdgeViews(first, seam, is_boundary)
 
 
-def contour_edges(batch: SurfaceBatch, planes) -> tuple | None:
+def contour_edges(batch: SurfaceBatch) -> tuple | None:
     """Lanes (view * E + edge) across which radiance may jump; per lane, whether the first face is front-facing, and whether both are, at
     a seam. None where there is no such edge.
     """
@@ -130,12 +92,11 @@ def contour_edges(batch: SurfaceBatch, planes) -> tuple | None:
 
     mi = loaded_mitsuba()
     num_edges = batch.tables.num_edges
-    views = edge_views(batch, planes)
+    views = edge_views(batch)
 
     def bit(bits, lane):
         view = lane // num_edges
-        mesh = mi.UInt32(dr.gather(mi.Float, batch.centers, view * 4 + 3))
-        word = (view // VIEWS_PER_WORD * batch.scene.num_meshes + mesh) * num_edges + lane - view * num_edges
+        word = (view // VIEWS_PER_WORD * batch.num_meshes + batch.mesh_of(view)) * num_edges + lane - view * num_edges
         return (dr.gather(mi.UInt32, bits, word) >> (view % VIEWS_PER_WORD)) & 1 == 1
 
     kept = dr.compress(views.is_boundary)
@@ -185,8 +146,7 @@ def allot_samples(batch: SurfaceBatch, kept, samples_per_edge: int) -> tuple:
     view_index = kept // batch.tables.num_edges
     edge = dr.gather(mi.Vector4u, batch.tables.edges, kept - view_index * batch.tables.num_edges)
     view = View.gather(batch.views, view_index)
-    base = view.mesh * batch.num_vertices
-    point_a, point_b = (view.to_camera(_vertex(batch.vertices, base + end)) for end in (edge.x, edge.y))
+    point_a, point_b = (batch.point(view_index, end) for end in (edge.x, edge.y))
     length = dr.norm(view.project(point_b) - view.project(point_a))
     # Edges that cross the camera's plane are not sampled; those that nearly do are long without being important.
     length = dr.select((point_a.z > NEAR) & (point_b.z > NEAR), dr.minimum(length, float(max(batch.film))), 0.0)
@@ -211,7 +171,7 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
 
     mi = loaded_mitsuba()
     tables = batch.tables
-    edges = contour_edges(batch, face_planes(batch))
+    edges = contour_edges(batch) if batch.grid is not None else None
     if edges is None:
         return None
     kept, front, front_seam = edges
@@ -225,9 +185,9 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
     view = View.gather(batch.views, view_index)
 
     # ---- Position on the edge, stratified in screen space ----
-    base = view.mesh * batch.num_vertices
+    base = batch.mesh_of(view_index) * batch.num_vertices
     ends = (base + edge.x, base + edge.y)
-    point_a, point_b = (view.to_camera(_vertex(batch.vertices, end)) for end in ends)
+    point_a, point_b = (batch.point(view_index, end) for end in (edge.x, edge.y))
     pixel_a, pixel_b = view.project(point_a), view.project(point_b)
     random, _ = mi.sample_tea_32(packed, batch.seed_gradient, TEA_ROUNDS)
     share = dr.rcp(mi.Float(count))
@@ -290,7 +250,7 @@ def scatter_contour_derivative(samples: ContourSamples, motion, radiance, mask) 
     mi = loaded_mitsuba()
     speed = mi.Float(0.0)
     for index, point, share in zip(samples.vertices, samples.points, samples.shares, strict=True):
-        speed += share * dr.dot(samples.outward, samples.view.project_derivative(point, _vertex(motion, index)))
+        speed += share * dr.dot(samples.outward, samples.view.project_derivative(point, packet_vector(motion, index)))
     swept = speed * samples.weight
     gain = samples.radiance * swept
     dr.scatter_add(radiance, mi.Vector4f(gain.x, gain.y, gain.z, 0.0), samples.pixel, samples.active)
@@ -314,32 +274,9 @@ def _background(batch: SurfaceBatch, view: View, view_index, position, depth, se
     """
     import drjit as dr
 
-    mi = loaded_mitsuba()
-    tables = batch.tables
-    limit = dr.gather(mi.Float, batch.bounds.depth_limit, view_index)
-    found = batch.scene.scene.ray_intersect_preliminary(view.ray(position, limit), coherent=False, active=active)
-    face = found.prim_index - view.mesh * tables.num_faces
-    is_hit = active & found.is_valid() & (face < tables.num_faces)
-    face = dr.select(is_hit, face, 0)
-    is_nearer = is_hit & (found.t < depth * (1.0 - DEPTH_TOLERANCE))
-    active = active & dr.select(second_face == NO_FACE, ~is_nearer, is_hit & (face == second_face))
-    uv = interpolated_uv(tables, face, found.prim_uv)
-    radiance = Footprint.at(uv, view_index, *batch.texture_size).value(batch.textures, is_hit & active)
-    return dr.select(is_hit, radiance, 0.0), is_hit, active
-
-
-def _vertex(vertices, index):
-    import drjit as dr
-
-    mi = loaded_mitsuba()
-    packet = dr.gather(mi.Vector4f, vertices, index)
-    return mi.Vector3f(packet.x, packet.y, packet.z)
-
-
-def _height(plane, point):
-    """Signed height of a point over a plane (both packets), scaled by the normal's length."""
-    return plane.x * point.x + plane.y * point.y + plane.z * point.z - plane.w
-
-
-def _num_words(batch: SurfaceBatch) -> int:
-    return -(-batch.num_views // VIEWS_PER_WORD)
+    sight = nearest_face(batch, view, view_index, position, active)
+    is_nearer = sight.depth < depth * (1.0 - DEPTH_TOLERANCE)
+    active = active & dr.select(second_face == NO_FACE, ~is_nearer, sight.is_hit & (sight.face == second_face))
+    uv = interpolated_uv(batch.tables, sight.face, sight.barycentric)
+    radiance = Footprint.at(uv, view_index, *batch.texture_size).value(batch.textures, sight.is_hit & active)
+    return dr.select(sight.is_hit, radiance, 0.0), sight.is_hit, active

@@ -3,7 +3,6 @@
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch
 from mitsuba_avatar.rendering.shading import face_corners, interpolated_uv
-from mitsuba_avatar.rendering.views import View
 from mitsuba_avatar.rendering.visibility import Hits
 
 
@@ -12,9 +11,9 @@ def scatter_layers(batch: SurfaceBatch, hits: Hits, layers) -> None:
     import drjit as dr
 
     mi = loaded_mitsuba()
-    is_first = hits.sample == 0
+    is_first = hits.slot % batch.samples_per_pixel == 0
     b1, b2 = hits.barycentric.x, hits.barycentric.y
-    _, (v0, v1, v2) = face_corners(batch, View.gather(batch.views, hits.view), hits.face)
+    _, (v0, v1, v2) = face_corners(batch, hits.view, hits.face)
     e1, e2 = v1 - v0, v2 - v0
     normal = dr.normalize(dr.cross(e1, e2))
     position = v0 + e1 * b1 + e2 * b2

@@ -16,19 +16,18 @@ from mitsuba_avatar.rendering.batch import SurfaceBatch
 from mitsuba_avatar.rendering.surface_tables import SurfaceTables
 from mitsuba_avatar.rendering.texture_lookup import Footprint
 from mitsuba_avatar.rendering.views import View
-from mitsuba_avatar.rendering.visibility import Hits
+from mitsuba_avatar.rendering.visibility import Hits, pixel_of_slot
 
 
-def face_corners(batch: SurfaceBatch, view: View, face) -> tuple:
+def face_corners(batch: SurfaceBatch, view_index, face) -> tuple:
     """Packet indices of a face's three vertices in the mesh of its view, and their local positions (Vector3f)."""
     import drjit as dr
 
     mi = loaded_mitsuba()
     corners = dr.gather(mi.Vector4u, batch.tables.faces, face)
-    base = view.mesh * batch.num_vertices
+    base = batch.mesh_of(view_index) * batch.num_vertices
     index = (base + corners.x, base + corners.y, base + corners.z)
-    packets = (dr.gather(mi.Vector4f, batch.vertices, i) for i in index)
-    return index, tuple(mi.Vector3f(packet.x, packet.y, packet.z) for packet in packets)
+    return index, tuple(batch.vertex(i) for i in index)
 
 
 def corner_uv(tables: SurfaceTables, face):
@@ -54,18 +53,41 @@ def shade(batch: SurfaceBatch, hits: Hits):
 
 
 def scatter_image(batch: SurfaceBatch, hits: Hits, radiance, image, mask) -> None:
-    """Add to image [B, 3, H, W] the radiance premultiplied by coverage, and to mask [B, H, W] the coverage; both flat."""
+    """Write to image [B, 3, H, W] the radiance premultiplied by coverage, and to mask [B, H, W] the coverage; both flat.
+
+    The samples of a pixel are added in their own order, not as they come: equal seeds give equal images, to the last bit.
+    """
     import drjit as dr
 
     mi = loaded_mitsuba()
+    count = batch.samples_per_pixel
+    if count == 1:  # no two lanes share a pixel
+        _write_pixels(batch, hits.pixel, hits.view, mi.Vector4f(*radiance, 1.0), image, mask)
+        return
+    samples = dr.zeros(mi.Float, hits.num_slots * 4)
+    dr.scatter(samples, mi.Vector4f(*radiance, 1.0), hits.slot, mode=dr.ReduceMode.NoConflicts)
+    lane = dr.arange(mi.UInt32, hits.num_slots // count)
+    _, total = dr.while_loop(
+        state=(mi.UInt32(0), mi.Vector4f(0.0)),
+        cond=lambda sample, _: sample < count,
+        body=lambda sample, total: (sample + 1, total + dr.gather(mi.Vector4f, samples, lane * count + sample)),
+        labels=("sample", "total"),
+    )
+    pixel, view_index, x, y = pixel_of_slot(batch, hits.cells, lane)
+    is_on_film = (x < batch.film[0]) & (y < batch.film[1])
+    _write_pixels(batch, pixel, view_index, total * (1.0 / count), image, mask, is_on_film)
+
+
+def _write_pixels(batch: SurfaceBatch, pixel, view_index, value, image, mask, active=True) -> None:
+    """Set radiance and coverage (Vector4f) of pixels, each written once."""
+    import drjit as dr
+
     plane = batch.film[0] * batch.film[1]
-    first = hits.pixel + hits.view * (2 * plane)
-    targets = [(image, first + channel * plane, radiance[channel]) for channel in range(3)]
-    for target, index, value in (*targets, (mask, hits.pixel, mi.Float(1.0))):
-        if batch.samples_per_pixel == 1:  # no two lanes share a pixel
-            dr.scatter(target, value, index, mode=dr.ReduceMode.NoConflicts)  # otherwise each scatter to one image is a kernel
-        else:
-            dr.scatter_add(target, value * (1.0 / batch.samples_per_pixel), index)
+    first = pixel + view_index * (2 * plane)
+    targets = [(image, first + channel * plane, value[channel]) for channel in range(3)]
+    for target, index, channel in (*targets, (mask, pixel, value.w)):
+        # NoConflicts: otherwise each scatter to one image is a kernel of its own.
+        dr.scatter(target, channel, index, active, mode=dr.ReduceMode.NoConflicts)
 
 
 @dataclass(frozen=True)
@@ -111,7 +133,7 @@ def hit_derivatives(batch: SurfaceBatch, hits: Hits) -> HitDerivatives:
     b1, b2 = hits.barycentric.x, hits.barycentric.y
     uv0, uv1, uv2 = corner_uv(batch.tables, hits.face)
     uv_e1, uv_e2 = uv1 - uv0, uv2 - uv0
-    index, (v0, v1, v2) = face_corners(batch, view, hits.face)
+    index, (v0, v1, v2) = face_corners(batch, hits.view, hits.face)
     e1, e2 = v1 - v0, v2 - v0
     # The ray's direction from the hit itself, scaled to unit depth: no random numbers need repeating.
     hit = view.to_camera(v0 + e1 * b1 + e2 * b2)

@@ -14,13 +14,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mitsuba_avatar.body.rig import Topology
-from mitsuba_avatar.rendering import contour, shading, visibility
+from mitsuba_avatar.rendering import contour, face_grid, facing, shading, visibility
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch
 from mitsuba_avatar.rendering.bridge import differentiable, flat_array, torch_tensor
 from mitsuba_avatar.rendering.cameras import CameraBatch
 from mitsuba_avatar.rendering.layers import scatter_layers
-from mitsuba_avatar.rendering.scene import MeshScene
 from mitsuba_avatar.rendering.surface_tables import SurfaceTables
 from mitsuba_avatar.rendering.texture_lookup import planar_texels, texel_packets
 from mitsuba_avatar.rendering.views import place
@@ -72,7 +71,6 @@ class SurfaceRenderer:
         self.samples_per_pixel = samples_per_pixel
         self.boundary_samples_per_edge = boundary_samples_per_edge
         self.tables = SurfaceTables(topology.faces, topology.uv, topology.uv_faces)
-        self._scenes: dict[int, MeshScene] = {}
         self._operation = _make_operation()
         self._wrapped = differentiable(self._render_drjit)
 
@@ -144,10 +142,8 @@ class SurfaceRenderer:
         with torch.no_grad():
             placement = place(vertices, cameras, mesh_index)
             packets = flat_array(torch.nn.functional.pad(motion, (0, 1)))
-        tables = [mi.TensorXf(table) for table in (placement.scene_vertices, placement.offset, placement.views, placement.centers)]
-        batch = self.batch(mi.TensorXf(textures.detach().contiguous()), len(vertices), tuple(tables), seed)
-        batch.scene.update(tables[0].array)
-        batch.bounds = visibility.bound_views(batch)
+        tables = tuple(mi.TensorXf(table) for table in (placement.vertices, placement.views, placement.centers))
+        batch = self.batch(mi.TensorXf(textures.detach().contiguous()), tables, seed)
         hits = visibility.trace_views(batch)
         radiance, mask = dr.zeros(mi.Float, batch.num_pixels * 4), dr.zeros(mi.Float, batch.num_pixels)
         if hits is not None:
@@ -159,20 +155,21 @@ class SurfaceRenderer:
         radiance = torch_tensor(radiance, (*shape, 4)).permute(0, 3, 1, 2)[:, :3]
         return radiance, torch_tensor(mask, shape)[:, None]
 
-    def batch(self, textures, num_meshes: int, tables: tuple, seed: int) -> SurfaceBatch:
+    def batch(self, textures, tables: tuple, seed: int) -> SurfaceBatch:
         """What one launch renders, from Dr.Jit tensors: textures [B, 3, h, w] and the tables of a `Placement`."""
         import drjit as dr
 
         mi = loaded_mitsuba()
-        scene_vertices, offset, views, centers = (table.array for table in tables)
+        vertices, views, centers = tables
         first, second = (dr.opaque(mi.UInt32, value) for value in decorrelated_seeds(seed))
-        return SurfaceBatch(
-            scene=self.scene(num_meshes),
+        batch = SurfaceBatch(
             tables=self.tables,
-            vertices=local_packets(scene_vertices, offset, self.topology.num_vertices),
+            vertices=vertices.array,
             textures=texel_packets(textures),
-            views=views,
-            centers=centers,
+            views=views.array,
+            centers=centers.array,
+            num_meshes=vertices.shape[0],
+            num_vertices=vertices.shape[1],
             num_views=textures.shape[0],
             texture_size=(textures.shape[2], textures.shape[3]),
             film=self.film,
@@ -180,12 +177,11 @@ class SurfaceRenderer:
             seed=first,
             seed_gradient=second,
         )
-
-    def scene(self, num_meshes: int) -> MeshScene:
-        """The scene for P meshes; made on first use."""
-        if num_meshes not in self._scenes:
-            self._scenes[num_meshes] = MeshScene(self.topology.faces, self.topology.num_vertices, num_meshes)
-        return self._scenes[num_meshes]
+        batch.triangles = facing.pack_triangles(batch)
+        batch.front = facing.views_from_front(batch)
+        batch.points = face_grid.camera_points(batch)
+        batch.grid = face_grid.build_face_grid(batch)
+        return batch
 
     @staticmethod
     def _call(vertices: Tensor, textures: Tensor, seed: int, has_layers: bool) -> "Call":
@@ -231,7 +227,7 @@ class SurfaceRenderer:
         mesh_index = self._check(vertices, textures, cameras, mesh_index)
         with torch.no_grad():
             placement = place(vertices.detach(), cameras, mesh_index)
-        tables = (placement.scene_vertices, placement.offset, placement.views, placement.centers)
+        tables = (placement.vertices, placement.views, placement.centers)
         radiance, mask, layers = self._wrapped(vertices, textures.contiguous(), tables, call)
         if not call.has_layers:
             return radiance, mask, layers
@@ -283,11 +279,7 @@ def _make_operation():
         def eval(self, vertices, textures, tables, call, renderer):
             mi = loaded_mitsuba()
             self.renderer, self.call, self.shapes = renderer, call, (vertices.shape, textures.shape)
-            self.batch = renderer.batch(textures, vertices.shape[0], tables, call.seed)
-            self.scene_vertices = tables[0].array  # `vertices` itself only receives the gradient
-            self.batch.scene.update(self.scene_vertices)
-            self.version = self.batch.scene.version
-            self.batch.bounds = visibility.bound_views(self.batch)
+            self.batch = renderer.batch(textures, tables, call.seed)  # `vertices` itself only receives the gradient
             self.hits = visibility.trace_views(self.batch)
             batch, (width, height) = self.batch, renderer.film
             radiance, mask = dr.zeros(mi.Float, batch.num_pixels * 3), dr.zeros(mi.Float, batch.num_pixels)
@@ -314,9 +306,6 @@ def _make_operation():
             if self.hits is not None:
                 shading.scatter_shading_adjoint(batch, self.hits, adjoint_image, vertex_gradient, texture_gradient)
             if call.moves_vertices:
-                if batch.scene.version != self.version:  # another batch was rendered since: bring this one's meshes back
-                    batch.scene.update(self.scene_vertices)
-                    self.version = batch.scene.version
                 samples = contour.sample_contours(batch, self.renderer.boundary_samples_per_edge)
                 if samples is not None:
                     contour.scatter_contour_adjoint(samples, adjoint_image, vertex_gradient)
@@ -333,18 +322,6 @@ def _make_operation():
 def decorrelated_seeds(seed: int) -> tuple[int, int]:
     """Seeds of the pixel jitter and of the boundary samples of one call: never equal to each other or to a neighbouring call's."""
     return (2 * seed) & 0xFFFFFFFF, (2 * seed + 1) & 0xFFFFFFFF
-
-
-def local_packets(scene_vertices, offset, num_vertices: int):
-    """Flat scene vertices [P * V * 3] to packets [P * V, 4] in local coordinates: minus each mesh's offset [P * 3], exactly."""
-    import drjit as dr
-
-    mi = loaded_mitsuba()
-    lane = dr.arange(mi.UInt32, len(scene_vertices) // 3)
-    point = dr.gather(mi.Point3f, scene_vertices, lane) - dr.gather(mi.Vector3f, offset, lane // num_vertices)
-    packets = dr.empty(mi.Float, len(lane) * 4)
-    dr.scatter(packets, mi.Vector4f(point.x, point.y, point.z, 0.0), lane)
-    return packets
 
 
 def unpack_gradient(packets):

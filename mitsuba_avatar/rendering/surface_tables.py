@@ -20,6 +20,7 @@ class SurfaceTables:
         edges: [E, 4] vertices a, b in the order of the first face's winding | first face | second face (NO_FACE where the mesh is open).
             Seams, where the two faces give their edge different texture coordinates, come first.
         num_seams: how many they are.
+        is_closed: whether every edge has two faces.
         edge_opposite: [E] vertex of the second face that is not on the edge (of the first face where the mesh is open).
         edge_uv: [E, 8] coordinates of a and b as corners of the first face, then of the second.
     """
@@ -33,6 +34,7 @@ class SurfaceTables:
         order = np.argsort(~is_seam, kind="stable")
         edges, opposite, edge_uv = edges[order], opposite[order], edge_uv[order]
         self.num_edges, self.num_seams = len(edges), int(is_seam.sum())
+        self.is_closed = bool((edges[:, 3] != NO_FACE).all())
         self.faces = mi.UInt32(np.pad(faces, ((0, 0), (0, 1))).astype(np.uint32).ravel())
         self.face_uv = mi.Float(np.pad(face_uv, ((0, 0), (0, 2))).ravel())
         self.edges = mi.UInt32(edges.astype(np.uint32).ravel())

@@ -1,12 +1,11 @@
-"""Views inside a Dr.Jit kernel: camera rows in one table, so that a single launch serves every view of every pose.
+"""Camera rows for the kernels, and the coordinate frame that everything is computed in.
 
-Three frames: *world*; *local*, world axes with the origin at the mean of the mesh that a view looks at; *scene*, the merged meshes set
-apart (see `scene`). Scene coordinates are rounded to float32 where they stand, and local coordinates are those minus the mesh's offset,
-which float32 subtracts exactly: rays traced in the scene and edges projected from local coordinates agree to the last bit. Without that
-a ray that should pass just outside an edge may hit it.
+Local coordinates: world axes, centred on the mean of each mesh's own vertices, so that float32 keeps its precision wherever in the world
+the person stands. Rays, projections and edges all start from these same rounded numbers.
 
-A row holds 20 floats: fx, fy, cx, cy | rotation R (9, row by row) | local camera centre (3) | scene camera centre (3) | mesh index (1),
-where x_camera = R (x_local - centre). Depths are z in camera axes; rays are scaled so that their parameter equals depth.
+A camera row: fx, fy, cx, cy | rotation world to camera, row by row | camera centre in local coordinates; a pixel is
+(fx x / z + cx, fy y / z + cy), where x_camera = R (x_local - centre). Depths are z in camera axes; rays are scaled so that their
+parameter equals depth.
 """
 
 from dataclasses import dataclass
@@ -17,43 +16,35 @@ from torch import Tensor
 
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.cameras import CameraBatch
-from mitsuba_avatar.rendering.scene import separation
 
-ROW = 20
+ROW = 16
 NEAR = 1e-3  # metres; points nearer to the camera plane have no projection
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where P meshes stand in local and scene coordinates.
+    """P meshes and B views in local coordinates.
 
     Attributes:
-        scene_vertices: [P, V, 3] metres, rounded.
-        offset: [P, 3] metres from local to scene coordinates.
-        views: [B, 20] camera rows.
-        centers: [B, 4] local camera centres and the mesh index.
+        vertices: [P, V, 4] metres, last entry 0.
+        views: [B, 16] camera rows.
+        centers: [B, 4] camera centres and the mesh index.
     """
 
-    scene_vertices: Float[Tensor, "P V 3"]
-    offset: Float[Tensor, "P 3"]
-    views: Float[Tensor, "B 20"]
+    vertices: Float[Tensor, "P V 4"]
+    views: Float[Tensor, "B 16"]
     centers: Float[Tensor, "B 4"]
 
 
 def place(vertices: Float[Tensor, "P V 3"], cameras: CameraBatch, mesh_index: Int[Tensor, " B"]) -> Placement:
-    """Set the meshes of a batch apart and write the camera rows of views that look at mesh `mesh_index[b]`."""
+    """Centre the meshes of a batch and write the camera rows of views that look at mesh `mesh_index[b]`."""
     device = vertices.device
     mean = vertices.mean(dim=1)
     rotation, mesh_index = cameras.camera_from_world[:, :3, :3].to(device), mesh_index.to(device)
-    centers = cameras.centers.to(device)
-    offset = torch.zeros_like(mean)
-    offset[:, 0] = separation(vertices, centers) * torch.arange(len(mean), device=device)
-    scene_vertices = (vertices - mean[:, None]) + offset[:, None]
-    scene_centers = (centers - mean[mesh_index]) + offset[mesh_index]
-    local_centers = scene_centers - offset[mesh_index]
-    mesh_column = mesh_index[:, None].to(torch.float32)
-    views = torch.cat([cameras.intrinsics.to(device), rotation.reshape(-1, 9), local_centers, scene_centers, mesh_column], dim=1)
-    return Placement(scene_vertices.contiguous(), offset, views.contiguous(), torch.cat([local_centers, mesh_column], dim=1).contiguous())
+    centers = cameras.centers.to(device) - mean[mesh_index]
+    views = torch.cat([cameras.intrinsics.to(device), rotation.reshape(-1, 9), centers], dim=1)
+    centers = torch.cat([centers, mesh_index[:, None].to(torch.float32)], dim=1)
+    return Placement(torch.nn.functional.pad(vertices - mean[:, None], (0, 1)), views, centers)
 
 
 @dataclass
@@ -63,9 +54,7 @@ class View:
     focal: tuple
     principal: tuple
     rotation: tuple  # nine floats
-    local_center: object  # Vector3f
-    scene_center: object  # Point3f
-    mesh: object  # UInt32
+    center: object  # Vector3f
 
     @staticmethod
     def gather(table, index) -> "View":
@@ -73,22 +62,15 @@ class View:
         import drjit as dr
 
         mi = loaded_mitsuba()
-        # Rows are five packets of four floats, 16-byte aligned.
+        # Rows are four packets of four floats, 16-byte aligned.
         packets = [dr.gather(mi.Vector4f, table, index * (ROW // 4) + k) for k in range(ROW // 4)]
-        r = [packets[1][0], packets[1][1], packets[1][2], packets[1][3], *[packets[2][k] for k in range(4)], packets[3][0]]
-        return View(
-            focal=(packets[0][0], packets[0][1]),
-            principal=(packets[0][2], packets[0][3]),
-            rotation=tuple(r),
-            local_center=mi.Vector3f(packets[3][1], packets[3][2], packets[3][3]),
-            scene_center=mi.Point3f(packets[4][0], packets[4][1], packets[4][2]),
-            mesh=mi.UInt32(packets[4][3]),
-        )
+        focal_x, focal_y, principal_x, principal_y, *rotation, x, y, z = (value for packet in packets for value in packet)
+        return View((focal_x, focal_y), (principal_x, principal_y), tuple(rotation), mi.Vector3f(x, y, z))
 
     def to_camera(self, point):
         """Local point (Vector3f) to camera axes."""
         mi = loaded_mitsuba()
-        r, p = self.rotation, point - self.local_center
+        r, p = self.rotation, point - self.center
         return mi.Vector3f(
             r[0] * p.x + r[1] * p.y + r[2] * p.z,
             r[3] * p.x + r[4] * p.y + r[5] * p.z,
@@ -139,10 +121,8 @@ class View:
         gz = -(gx * point_camera.x + gy * point_camera.y) * inverse_depth
         return self.to_world_direction(mi.Vector3f(gx, gy, gz))
 
-    def ray(self, pixel, depth_limit):
-        """Scene ray through a pixel position (Point2f); its parameter is depth, and it ends at `depth_limit` metres."""
+    def direction(self, pixel):
+        """Direction (Vector3f, world axes) of the ray through a pixel position (Point2f), of unit depth: its parameter is depth."""
         mi = loaded_mitsuba()
-        direction = mi.Vector3f((pixel.x - self.principal[0]) / self.focal[0], (pixel.y - self.principal[1]) / self.focal[1], 1.0)
-        ray = mi.Ray3f(self.scene_center, self.to_world_direction(direction))
-        ray.maxt = depth_limit
-        return ray
+        x, y = (pixel.x - self.principal[0]) / self.focal[0], (pixel.y - self.principal[1]) / self.focal[1]
+        return self.to_world_direction(mi.Vector3f(x, y, 1.0))

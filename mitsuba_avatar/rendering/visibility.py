@@ -1,18 +1,34 @@
 """Primary visibility: which face, and where on it, every sample of every pixel of every view sees. One launch for all views.
 
-Only pixels that the mesh can cover are traced: the projected faces mark 4x4-pixel tiles, and a lane is one sample of one pixel of a
-marked tile, so that neighbouring lanes trace neighbouring rays.
+Only cells of the film that list faces (`face_grid`) are looked at: a lane is one sample of one pixel of such a cell, so that neighbouring
+lanes test the same faces.
 """
 
 from dataclasses import dataclass
 
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
-from mitsuba_avatar.rendering.batch import SurfaceBatch, ViewBounds
-from mitsuba_avatar.rendering.views import NEAR, View
+from mitsuba_avatar.rendering.batch import SurfaceBatch
+from mitsuba_avatar.rendering.facing import Triangle
+from mitsuba_avatar.rendering.views import View
 
-TILE = 4  # pixels on a side
-ROUNDING = 0.02  # pixels by which the projection of a vertex and the ray towards it may disagree, and more
 TEA_ROUNDS = 6  # fewer rounds leave correlations that bias gradients by tens of per cent (measured with 3)
+
+
+@dataclass
+class Sight:
+    """What a camera ray meets first, one per lane.
+
+    Attributes:
+        is_hit: whether it meets anything.
+        face: of the topology, 0..F-1; 0 for a miss.
+        barycentric: Point2f, weights of the face's second and third vertex.
+        depth: metres along the camera's z axis; infinite for a miss.
+    """
+
+    is_hit: object
+    face: object
+    barycentric: object
+    depth: object
 
 
 @dataclass
@@ -23,81 +39,71 @@ class Hits:
         count: number of lanes.
         pixel: [count] index into the B * H * W pixels of the batch.
         view: [count] row of the camera table.
-        sample: [count] number of the sample inside its pixel.
+        slot: [count] which of the samples looked at this is, those of a pixel one after the other; num_slots: how many there are.
         face: [count] face of the topology, 0..F-1.
         barycentric: Point2f, weights of the face's second and third vertex.
         depth: [count] metres along the camera's z axis.
+        cells: [N] cells that list faces.
     """
 
     count: int
     pixel: object
     view: object
-    sample: object
+    slot: object
+    num_slots: int
     face: object
     barycentric: object
     depth: object
+    cells: object
 
     def columns(self) -> list:
         """The arrays, to evaluate them together with what is computed from them."""
-        return [self.pixel, self.view, self.sample, self.face, self.barycentric, self.depth]
+        return [self.pixel, self.view, self.slot, self.face, self.barycentric, self.depth]
 
 
-def bound_views(batch: SurfaceBatch) -> ViewBounds:
-    """Tiles that the faces of each view's mesh may cover, and its farthest depth."""
+def nearest_face(batch: SurfaceBatch, view: View, view_index, position, active=True) -> Sight:
+    """What the ray through a position on the film (Point2f, pixels) of a view meets first: all faces of its cell are tested.
+
+    The test is that of Moeller and Trumbore ("Fast, minimum storage ray/triangle intersection", 1997), with normals computed beforehand.
+    """
     import drjit as dr
 
     mi = loaded_mitsuba()
-    num_vertices = batch.num_vertices
-    lane = dr.arange(mi.UInt32, batch.num_views * num_vertices)
-    view_index = lane // num_vertices
-    view = View.gather(batch.views, view_index)
-    vertex = dr.gather(mi.Vector4f, batch.vertices, view.mesh * num_vertices + lane % num_vertices)
-    point = view.to_camera(mi.Vector3f(vertex.x, vertex.y, vertex.z))
-    pixel = view.project(point)
-    pixels = dr.empty(mi.Float, len(lane) * 2)
-    behind = dr.select(point.z > NEAR, 0.0, dr.inf)
-    dr.scatter(pixels, mi.Point2f(pixel.x + behind, pixel.y), lane, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(pixels, point.z)  # in one kernel; a reduction evaluates its argument by itself
-    nearest = dr.block_reduce(dr.ReduceOp.Min, point.z, num_vertices)
-    farthest = dr.block_reduce(dr.ReduceOp.Max, point.z, num_vertices)
+    grid, (width, height) = batch.grid, batch.film
+    column = mi.UInt32(dr.clip(position.x, 0.0, width - 1.0)) // grid.cell
+    row = mi.UInt32(dr.clip(position.y, 0.0, height - 1.0)) // grid.cell
+    cell = (view_index * grid.down + row) * grid.across + column
+    end = dr.gather(mi.UInt32, grid.end, cell, active)
+    start = end - dr.gather(mi.UInt32, grid.count, cell, active)
+    direction, center, first = view.direction(position), view.center, batch.mesh_of(view_index) * batch.tables.num_faces
 
-    width, height = batch.film
-    across, down = -(-width // TILE), -(-height // TILE)
-    # A vertex behind the camera bounds nothing: its view traces the whole film.
-    view_index = dr.arange(mi.UInt32, batch.num_views * across * down) // (across * down)
-    is_touched = (dr.gather(mi.Float, nearest, view_index) <= NEAR) & (dr.gather(mi.Float, farthest, view_index) > NEAR)
-    dr.eval(is_touched)
-    _mark_tiles(batch, pixels, is_touched)
-    return ViewBounds(tiles=dr.compress(is_touched), depth_limit=farthest * 1.001 + 0.01)
+    def test(entry, depth, b1, b2, nearest):
+        face = dr.gather(mi.UInt32, grid.faces, entry)
+        triangle = Triangle.gather(batch.triangles, first + face)
+        towards = triangle.corner - center
+        volume = dr.dot(triangle.normal, direction)
+        across = dr.cross(direction, towards)
+        inverse = dr.rcp(volume)
+        u, v = -dr.dot(across, triangle.edge2) * inverse, dr.dot(across, triangle.edge1) * inverse
+        t = dr.dot(triangle.normal, towards) * inverse
+        # The order of a cell's faces varies from run to run: where two are equally near, the first of the topology counts.
+        is_nearer = (t < depth) | ((t == depth) & (face < nearest))
+        is_met = (volume != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & is_nearer
+        return (
+            entry + 1,
+            dr.select(is_met, t, depth),
+            dr.select(is_met, u, b1),
+            dr.select(is_met, v, b2),
+            dr.select(is_met, face, nearest),
+        )
 
-
-def _mark_tiles(batch: SurfaceBatch, pixels, is_touched) -> None:
-    """Set the tiles [B * tiles of a film] under the bounding box of each face; pixels [B * V, 2], infinite behind the camera."""
-    import drjit as dr
-
-    mi = loaded_mitsuba()
-    num_faces, num_vertices = batch.tables.num_faces, batch.num_vertices
-    lane = dr.arange(mi.UInt32, batch.num_views * num_faces)
-    view_index = lane // num_faces
-    corners = dr.gather(mi.Vector4u, batch.tables.faces, lane - view_index * num_faces)
-    a, b, c = (dr.gather(mi.Point2f, pixels, view_index * num_vertices + corner) for corner in (corners.x, corners.y, corners.z))
-    low, high = dr.minimum(dr.minimum(a, b), c) - ROUNDING, dr.maximum(dr.maximum(a, b), c) + ROUNDING
-    width, height = batch.film
-    across, down = -(-width // TILE), -(-height // TILE)
-    is_inside = (high.x >= 0) & (high.y >= 0) & (low.x < width) & (low.y < height) & (high.x < dr.inf)
-    first_x, first_y = mi.UInt32(dr.maximum(low.x, 0.0)) // TILE, mi.UInt32(dr.maximum(low.y, 0.0)) // TILE
-    last_x = mi.UInt32(dr.clip(high.x, 0.0, width - 1.0)) // TILE
-    last_y = mi.UInt32(dr.clip(high.y, 0.0, height - 1.0)) // TILE
-    start = view_index * (across * down)
-
-    def mark(x, y):
-        dr.scatter(is_touched, mi.Bool(True), start + y * across + x, mode=dr.ReduceMode.NoConflicts)
-        is_row_done = x >= last_x
-        return dr.select(is_row_done, first_x, x + 1), dr.select(is_row_done, y + 1, y)
-
-    first = dr.select(is_inside, first_y, last_y + 1)
-    dr.while_loop(state=(first_x, first), cond=lambda x, y: y <= last_y, body=mark, labels=("x", "y"))
-    dr.eval(is_touched)
+    _, depth, b1, b2, face = dr.while_loop(
+        state=(start, mi.Float(dr.inf), mi.Float(0.0), mi.Float(0.0), mi.UInt32(0)),
+        cond=lambda entry, *_: entry < end,
+        body=test,
+        labels=("entry", "depth", "b1", "b2", "nearest"),
+    )
+    return Sight(depth < dr.inf, face, mi.Point2f(b1, b2), depth)
 
 
 def jitter(pixel, sample, seed, samples_per_pixel: int):
@@ -122,50 +128,45 @@ def golden_lattice(index, count: int, shift):
 
 
 def trace_views(batch: SurfaceBatch) -> Hits | None:
-    """Trace all samples of all tiles and keep those that hit their own mesh; None when nothing is hit. The result is not evaluated."""
+    """Look through all samples of all cells that list faces and keep those that meet one; None when there is none. Not evaluated."""
     import drjit as dr
 
-    bounds, num_faces = batch.bounds, batch.tables.num_faces
-    if len(bounds.tiles) == 0:
+    if batch.grid is None:
         return None
     mi = loaded_mitsuba()
-    lane = dr.arange(mi.UInt32, len(bounds.tiles) * TILE * TILE * batch.samples_per_pixel)
-    pixel, view_index, sample, x, y = _pixel_of_lane(batch, lane)
-    view = View.gather(batch.views, view_index)
-    position = mi.Point2f(x, y) + jitter(pixel, sample, batch.seed, batch.samples_per_pixel)
-    ray = view.ray(position, dr.gather(mi.Float, bounds.depth_limit, view_index))
-    active = (x < batch.film[0]) & (y < batch.film[1])
-    found = batch.scene.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    face = found.prim_index - view.mesh * num_faces
-    is_hit = active & found.is_valid() & (face < num_faces)
+    cells = dr.compress(batch.grid.count > 0)
+    num_slots = len(cells) * batch.grid.cell**2 * batch.samples_per_pixel
+    lane = dr.arange(mi.UInt32, num_slots)
+    pixel, view_index, x, y = pixel_of_slot(batch, cells, lane // batch.samples_per_pixel)
+    position = mi.Point2f(x, y) + jitter(pixel, lane % batch.samples_per_pixel, batch.seed, batch.samples_per_pixel)
+    is_on_film = (x < batch.film[0]) & (y < batch.film[1])
+    sight = nearest_face(batch, View.gather(batch.views, view_index), view_index, position, is_on_film)
     # One packet a hit: compaction then reads one cache line instead of four.
-    packets = dr.empty(mi.Float, len(lane) * 4)
-    packet = mi.Vector4f(found.prim_uv.x, found.prim_uv.y, found.t, dr.reinterpret_array(mi.Float, face))
-    dr.scatter(packets, packet, lane, is_hit, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(packets, is_hit)
-    kept = dr.compress(is_hit)
-    if len(kept) == 0:
+    packets = dr.empty(mi.Float, num_slots * 4)
+    packet = mi.Vector4f(*sight.barycentric, sight.depth, dr.reinterpret_array(mi.Float, sight.face))
+    dr.scatter(packets, packet, lane, sight.is_hit, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(packets, sight.is_hit)
+    slot = dr.compress(sight.is_hit)
+    if len(slot) == 0:
         return None
-    pixel, view_index, sample, _, _ = _pixel_of_lane(batch, kept)
-    packet = dr.gather(mi.Vector4f, packets, kept)
-    return Hits(len(kept), pixel, view_index, sample, dr.reinterpret_array(mi.UInt32, packet.w), mi.Point2f(packet.x, packet.y), packet.z)
+    pixel, view_index, _, _ = pixel_of_slot(batch, cells, slot // batch.samples_per_pixel)
+    packet = dr.gather(mi.Vector4f, packets, slot)
+    face, barycentric = dr.reinterpret_array(mi.UInt32, packet.w), mi.Point2f(packet.x, packet.y)
+    return Hits(len(slot), pixel, view_index, slot, num_slots, face, barycentric, packet.z, cells)
 
 
-def _pixel_of_lane(batch: SurfaceBatch, lane) -> tuple:
-    """Index of a lane's pixel among all of the batch, its view, its sample, and the pixel's x and y."""
+def pixel_of_slot(batch: SurfaceBatch, cells, slot) -> tuple:
+    """Index of a pixel among all of the batch, its view, and its x and y, from its number among the pixels of `cells`."""
     import drjit as dr
 
     mi = loaded_mitsuba()
-    width, height = batch.film
-    across, down = -(-width // TILE), -(-height // TILE)
-    per_tile = TILE * TILE * batch.samples_per_pixel
-    marked = lane // per_tile
-    within = lane - marked * per_tile
-    sample, within = within // (TILE * TILE), within % (TILE * TILE)
-    tile = dr.gather(mi.UInt32, batch.bounds.tiles, marked)
-    view_index = tile // (across * down)
-    tile -= view_index * (across * down)
-    row = tile // across
-    x = (tile - row * across) * TILE + within % TILE
-    y = row * TILE + within // TILE
-    return (view_index * height + y) * width + x, view_index, sample, x, y
+    grid, (width, height) = batch.grid, batch.film
+    listed = slot // grid.cell**2
+    within = slot - listed * grid.cell**2
+    cell = dr.gather(mi.UInt32, cells, listed)
+    view_index = cell // (grid.across * grid.down)
+    cell -= view_index * (grid.across * grid.down)
+    row = cell // grid.across
+    x = (cell - row * grid.across) * grid.cell + within % grid.cell
+    y = row * grid.cell + within // grid.cell
+    return (view_index * height + y) * width + x, view_index, x, y
