@@ -1,10 +1,11 @@
-"""Time the renderer: `python -m mitsuba_avatar.bench [--json FILE] [--figure FILE]`.
+"""Time the renderer: `python -m mitsuba_avatar.bench [--json FILE] [--noise] [--figure FILE]`.
 
 One table: milliseconds a view, forward and forward + backward, of this project's surface renderer on the Anny body, against Mitsuba's
 own `direct_projective` integrator (sppc = 1, sppp = 1, sppi = 0) on the same mesh, and against its primary rays alone as the floor. The
 contenders take turns, so that whatever else the machine does falls on all of them; figures are medians of the rounds.
 
-A second table times ambient occlusion against trimesh with embreex and against libigl's Embree, where they are installed.
+A second table times ambient occlusion against trimesh with embreex and against libigl's Embree, where they are installed. With --noise
+another table shows how noisy gradients are at different sample counts, and what they cost.
 """
 
 import json
@@ -35,7 +36,8 @@ class BenchCommand:
 
     json: Path | None = None  # write the rows of the first table here
     figure: Path | None = None  # draw the derivative of each pixel beside finite differences here, and time nothing
-    rounds: int = 7  # turns of each contender
+    noise: bool = False  # measure the noise of gradients at different sample counts instead
+    rounds: int = 7  # turns of each contender; with --noise also seeds, ten a turn
     variant: str = "auto"  # Mitsuba variant
 
 
@@ -69,6 +71,9 @@ def main(arguments: list[str] | None = None) -> int:
         from mitsuba_avatar.benchmarking.derivative_figure import draw_derivative_figure
 
         draw_derivative_figure(rig, command.figure)
+        return 0
+    if command.noise:
+        write_noise_table(rig, command.rounds)
         return 0
     sys.stdout.write(f"{variant}, {torch.get_num_threads()} torch threads, median of {command.rounds} rounds, milliseconds a view\n")
     sys.stdout.write(
@@ -111,6 +116,27 @@ def time_renderers(workload: Workload, rounds: int) -> Row:
         meshes=len(workload.vertices),
         **{name: milliseconds / views for name, milliseconds in times.items()},
     )
+
+
+def write_noise_table(rig: Rig, rounds: int) -> None:
+    """Measure and print what sample counts cost and what they give, row by row."""
+    from mitsuba_avatar.benchmarking.noise import body_motions, contenders, measure_noise, noise_workload
+
+    workload = noise_workload(rig)
+    swept = contenders(workload)
+    times = take_turns({contender.name: contender.render for contender in swept}, rounds)
+    motions = body_motions(workload.vertices)
+    sys.stdout.write(
+        "standard deviation of one evaluation, per cent of the largest derivative, and times square root of milliseconds\n"
+        "samples a pixel, an edge       ms   radiance     mask   radiance x sqrt(ms)   mask x sqrt(ms)\n"
+    )
+    for contender in swept:
+        row = measure_noise(contender, motions, 10 * rounds, times[contender.name])
+        per_cent = [100 * value for value in (row.radiance, row.mask, row.at_equal_time(row.radiance), row.at_equal_time(row.mask))]
+        sys.stdout.write(
+            f"{row.name:>24} {row.milliseconds:8.1f} {per_cent[0]:10.2f} {per_cent[1]:8.2f} {per_cent[2]:21.1f} {per_cent[3]:17.1f}\n"
+        )
+        sys.stdout.flush()
 
 
 def take_turns(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, float]:

@@ -110,7 +110,7 @@ class RenderingSettings:
 
     variant: str = "auto"  # auto: cuda_ad_rgb where it works, llvm_ad_rgb otherwise
     samples_per_pixel: int = 4  # primal rays per pixel; with 1, the image loss pays for aliasing noise and blurs the texture instead
-    boundary_samples_per_edge: int = 2  # stratified positions on every contour edge
+    boundary_samples_per_edge: int = 4  # stratified positions on every contour edge
     ambient_occlusion_rays: int = 64  # per texel
     ambient_occlusion_distance: float = 0.6  # metres; hits farther away do not occlude
 

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -40,6 +41,41 @@ def test_figure(small, tmp_path, monkeypatch):
         assert picture.width > 800
 
 
+def test_noise_table(small, monkeypatch, capsys):
+    from mitsuba_avatar.benchmarking import noise
+
+    monkeypatch.setattr(noise, "SETTINGS", ((1, 1), (1, 8)))
+    for name, value in (("WIDTH", 40), ("HEIGHT", 30), ("VIEWS", 2)):
+        monkeypatch.setattr(noise, name, value)
+    assert bench.main([*small, "--noise"]) == 0
+    rows = {line[:24].strip(): [float(word) for word in line[24:].split()] for line in capsys.readouterr().out.splitlines()[2:]}
+    assert list(rows) == ["1, 1", "1, 8", "1, 18", "direct_projective"]
+    for milliseconds, radiance, mask, *at_equal_time in rows.values():  # rounded where printed
+        assert at_equal_time[0] == pytest.approx(radiance * milliseconds**0.5, rel=0.05, abs=0.1)
+        assert np.isnan(mask) or at_equal_time[1] == pytest.approx(mask * milliseconds**0.5, rel=0.05, abs=0.1)
+    assert rows["1, 8"][2] < 0.5 * rows["1, 1"][2], "samples on edges quiet the mask"
+
+
+def test_the_peers_gradient_is_that_of_the_welded_mesh(small):
+    """Copies of a vertex along seams, which Mitsuba needs, give their gradients to the one vertex."""
+    from mitsuba_avatar.benchmarking.contenders import DirectProjective
+
+    workload = bench.make_workload(make_small_rig(), 40, 30, 4, 2)
+    peer = DirectProjective(workload)
+    peer.seed = 5
+    split = [np.array(gradient).reshape(-1, 3) for gradient in peer._draw(with_gradients=True)]
+    peer.seed = 5
+    welded = peer.vertex_gradients().numpy()
+    source = peer.source.numpy()
+    copied = np.flatnonzero(np.bincount(source) > 1)
+    assert len(copied) > 5 and welded.shape == workload.vertices.shape
+    for mesh in range(2):
+        scale = np.abs(split[mesh]).max()
+        for vertex in copied[:5]:
+            np.testing.assert_allclose(welded[mesh, vertex], split[mesh][source == vertex].sum(axis=0), atol=1e-3 * scale)
+        np.testing.assert_allclose(welded[mesh].sum(axis=0), split[mesh].sum(axis=0), atol=1e-2 * scale)
+
+
 def test_an_unknown_variant_is_refused(capsys):
     assert bench.main(["--variant", "scalar_rgb"]) == 2
     assert "expected 'auto', 'llvm_ad_rgb' or 'cuda_ad_rgb'" in capsys.readouterr().err
@@ -48,7 +84,6 @@ def test_an_unknown_variant_is_refused(capsys):
 def test_contenders_draw_the_same_picture(small):
     """The peer's mesh, texture orientation and cameras are those of the renderer that it is timed against."""
     import drjit as dr
-    import numpy as np
     import torch
 
     from mitsuba_avatar.benchmarking.contenders import DirectProjective

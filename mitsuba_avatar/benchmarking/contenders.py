@@ -15,7 +15,7 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.rendering.ambient_occlusion import LIFT, AmbientOcclusion
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
-from mitsuba_avatar.rendering.bridge import flat_array
+from mitsuba_avatar.rendering.bridge import flat_array, torch_tensor
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 
 
@@ -24,7 +24,9 @@ class Ours:
 
     def __init__(self, workload: Workload):
         self.workload = workload
-        self.renderer = SurfaceRenderer(workload.rig.topology, workload.width, workload.height)
+        self.renderer = SurfaceRenderer(
+            workload.rig.topology, workload.width, workload.height, samples_per_pixel=1, boundary_samples_per_edge=2
+        )
         self.seed = 0
 
     def forward(self) -> None:
@@ -85,11 +87,19 @@ class DirectProjective:
         """Images, loss and gradients."""
         self._draw(with_gradients=True)
 
-    def _draw(self, with_gradients: bool) -> None:
+    def vertex_gradients(self) -> torch.Tensor:
+        """Gradient of the loss with respect to the vertices of the welded meshes, [P, V, 3]."""
+        gradients = torch.zeros_like(self.workload.vertices)
+        for gradient, split in zip(gradients, self._draw(with_gradients=True), strict=True):
+            gradient.index_add_(0, self.source, torch_tensor(split, (len(self.source), 3)))
+        return gradients
+
+    def _draw(self, with_gradients: bool) -> list:
+        """Draw all views; returns the gradient (flat mi.Float) of every mesh's vertices where wanted."""
         import drjit as dr
 
         mi = loaded_mitsuba()
-        views_per_mesh = len(self.sensors) // len(self.positions)
+        views_per_mesh, gradients = len(self.sensors) // len(self.positions), []
         for mesh, positions in enumerate(self.positions):
             moved = mi.Float(positions)
             if with_gradients:
@@ -116,6 +126,9 @@ class DirectProjective:
                 else:
                     dr.eval(image)
             dr.sync_thread()
+            if with_gradients:
+                gradients.append(dr.grad(moved))
+        return gradients
 
 
 class PrimaryRays:

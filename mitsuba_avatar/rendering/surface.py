@@ -60,7 +60,7 @@ class SurfaceRenderer:
             its reciprocal.
     """
 
-    def __init__(self, topology: Topology, width: int, height: int, samples_per_pixel: int = 1, boundary_samples_per_edge: int = 2):
+    def __init__(self, topology: Topology, width: int, height: int, samples_per_pixel: int = 1, boundary_samples_per_edge: int = 4):
         if min(width, height, samples_per_pixel, boundary_samples_per_edge) < 1:
             raise ValueError(
                 f"SurfaceRenderer(): width, height and sample counts must be at least 1; got {width}, {height}, {samples_per_pixel}, "
