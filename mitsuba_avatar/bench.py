@@ -1,11 +1,12 @@
-"""Time the renderer: `python -m mitsuba_avatar.bench [--json FILE] [--noise] [--figure FILE]`.
+"""Time the renderer: `python -m mitsuba_avatar.bench [--json FILE] [--noise] [--bias] [--figure FILE]`.
 
 One table: milliseconds a view, forward and forward + backward, of this project's surface renderer on the Anny body, against Mitsuba's
 own `direct_projective` integrator (sppc = 1, sppp = 1, sppi = 0) on the same mesh, and against its primary rays alone as the floor. The
 contenders take turns, so that whatever else the machine does falls on all of them; figures are medians of the rounds.
 
 A second table times ambient occlusion against trimesh with embreex and against libigl's Embree, where they are installed. With --noise
-another table shows how noisy gradients are at different sample counts, and what they cost.
+another table shows how noisy gradients are at different sample counts, and what they cost; with --bias, how far their means are from finite
+differences.
 """
 
 import json
@@ -37,7 +38,8 @@ class BenchCommand:
     json: Path | None = None  # write the rows of the first table here
     figure: Path | None = None  # draw the derivative of each pixel beside finite differences here, and time nothing
     noise: bool = False  # measure the noise of gradients at different sample counts instead
-    rounds: int = 7  # turns of each contender; with --noise also seeds, ten a turn
+    bias: bool = False  # hold mean gradients against finite differences instead
+    rounds: int = 7  # turns of each contender; with --noise and --bias also seeds, ten a turn
     variant: str = "auto"  # Mitsuba variant
 
 
@@ -74,6 +76,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     if command.noise:
         write_noise_table(rig, command.rounds)
+        return 0
+    if command.bias:
+        write_bias_table(rig, command.rounds)
         return 0
     sys.stdout.write(f"{variant}, {torch.get_num_threads()} torch threads, median of {command.rounds} rounds, milliseconds a view\n")
     sys.stdout.write(
@@ -120,23 +125,50 @@ def time_renderers(workload: Workload, rounds: int) -> Row:
 
 def write_noise_table(rig: Rig, rounds: int) -> None:
     """Measure and print what sample counts cost and what they give, row by row."""
-    from mitsuba_avatar.benchmarking.noise import body_motions, contenders, measure_noise, noise_workload
+    from mitsuba_avatar.benchmarking.noise import contenders, measure_noise, noise_workload
 
     workload = noise_workload(rig)
     swept = contenders(workload)
     times = take_turns({contender.name: contender.render for contender in swept}, rounds)
-    motions = body_motions(workload.vertices)
     sys.stdout.write(
         "standard deviation of one evaluation, per cent of the largest derivative, and times square root of milliseconds\n"
         "samples a pixel, an edge       ms   radiance     mask   radiance x sqrt(ms)   mask x sqrt(ms)\n"
     )
     for contender in swept:
-        row = measure_noise(contender, motions, 10 * rounds, times[contender.name])
+        row = measure_noise(contender, workload, 10 * rounds, times[contender.name])
         per_cent = [100 * value for value in (row.radiance, row.mask, row.at_equal_time(row.radiance), row.at_equal_time(row.mask))]
         sys.stdout.write(
             f"{row.name:>24} {row.milliseconds:8.1f} {per_cent[0]:10.2f} {per_cent[1]:8.2f} {per_cent[2]:21.1f} {per_cent[3]:17.1f}\n"
         )
         sys.stdout.flush()
+
+
+def write_bias_table(rig: Rig, rounds: int) -> None:
+    """Hold mean gradients against finite differences and print the table."""
+    from mitsuba_avatar.benchmarking.bias import MOTIONS, finite_differences, mean_derivatives
+    from mitsuba_avatar.benchmarking.noise import noise_workload, projective_contender, surface_contender
+    from mitsuba_avatar.progress import progress_bar
+
+    workload = noise_workload(rig)
+    contenders = {"ours": surface_contender(workload, 4, 4), "direct_projective": projective_contender(workload)}
+    done, total = 0, rounds + 10 * rounds * len(contenders)
+    with progress_bar("gradients", total) as bar:
+
+        def count() -> None:
+            nonlocal done
+            done += 1
+            bar.update(done)
+
+        reference = finite_differences(workload, rounds, count)
+        estimates = {name: mean_derivatives(contender, workload, 10 * rounds, count) for name, contender in contenders.items()}
+    sys.stdout.write("mean derivative minus finite difference, per cent of the largest of the four, +- standard error\n")
+    sys.stdout.write(f"{'':>28}" + "".join(f"{motion:>18}" for motion in MOTIONS) + "\n")
+    for name, estimate in estimates.items():
+        bias = estimate.bias(reference)
+        for row, part in enumerate(("radiance", "mask")):
+            cells = [f"{100 * bias.mean[row, k]:+10.2f} +- {100 * bias.error[row, k]:4.2f}" for k in range(len(MOTIONS))]
+            if not np.isnan(bias.mean[row]).any():
+                sys.stdout.write(f"{name + ', ' + part:>28}" + "".join(f"{cell:>18}" for cell in cells) + "\n")
 
 
 def take_turns(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, float]:

@@ -56,6 +56,32 @@ def test_noise_table(small, monkeypatch, capsys):
     assert rows["1, 8"][2] < 0.5 * rows["1, 1"][2], "samples on edges quiet the mask"
 
 
+def test_bias_is_a_share_of_the_largest_derivative():
+    from mitsuba_avatar.benchmarking.bias import Estimate
+
+    reference = Estimate(np.array([[2.0, -10.0], [1.0, 0.5]]), np.array([[0.3, 0.0], [0.0, 0.0]]))
+    estimate = Estimate.of([np.array([[3.0, -10.0], [1.0, 0.4]]), np.array([[4.0, -10.0], [1.0, 0.8]])])
+    bias = estimate.bias(reference)
+    np.testing.assert_allclose(bias.mean, [[0.15, 0.0], [0.0, 0.1]])
+    np.testing.assert_allclose(bias.error, [[np.hypot(0.5, 0.3) / 10, 0.0], [0.0, 0.2]])
+
+
+@pytest.mark.slow
+def test_bias_table(small, monkeypatch, capsys):
+    """On a small film, where half a pixel is far, a gradient without its silhouettes would be off by a multiple of this."""
+    from mitsuba_avatar.benchmarking import bias, noise
+
+    for name, value in (("WIDTH", 40), ("HEIGHT", 30), ("VIEWS", 2)):
+        monkeypatch.setattr(noise, name, value)
+    monkeypatch.setattr(bias, "SAMPLES", 64)
+    assert bench.main([*small[:2], "--rounds", "2", "--bias"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["sideways", "up", "turn", "bend"]
+    assert [line[:28].strip() for line in lines[2:]] == ["ours, radiance", "ours, mask", "direct_projective, radiance"]
+    means = [float(word) for word in lines[3][28:].replace("+-", " ").split()][::2]
+    assert max(map(abs, means)) < 15
+
+
 def test_the_peers_gradient_is_that_of_the_welded_mesh(small):
     """Copies of a vertex along seams, which Mitsuba needs, give their gradients to the one vertex."""
     from mitsuba_avatar.benchmarking.contenders import DirectProjective

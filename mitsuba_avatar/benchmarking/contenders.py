@@ -75,9 +75,13 @@ class DirectProjective:
         (self.positions_key,) = [key for key in self.parameters.keys() if key.endswith("vertex_positions")]  # noqa: SIM118 (iteration gives pairs)
         (self.texture_key,) = [key for key in self.parameters.keys() if key.endswith("radiance.data")]  # noqa: SIM118
         self.sensors = [mi.load_dict(sensor) for sensor in _sensors(workload)]
-        self.positions = [flat_array(vertices[self.source]) for vertices in workload.vertices]
+        self.place(workload.vertices)
         self.weights = [mi.TensorXf(np.ascontiguousarray(weights[:3].permute(1, 2, 0).numpy())) for weights in workload.weights]
         dr.eval(self.positions, self.textures, self.weights)
+
+    def place(self, vertices: torch.Tensor) -> None:
+        """Set the vertices [P, V, 3] of the welded meshes that the next call draws."""
+        self.positions = [flat_array(mesh[self.source]) for mesh in vertices]
 
     def forward(self) -> None:
         """Images only."""

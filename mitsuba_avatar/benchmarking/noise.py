@@ -30,12 +30,12 @@ class Contender:
     Attributes:
         name: of its row.
         render: one call, forward and backward, as it is timed.
-        derivatives: [2, K] of the radiance's and the mask's loss along motions [K, P, V, 3], with a seed.
+        derivatives: [2, K] of the radiance's and the mask's loss along motions [K, P, V, 3], of given vertices [P, V, 3], with a seed.
     """
 
     name: str
     render: Callable[[], None]
-    derivatives: Callable[[Float[Tensor, "K P V 3"], int], Float[np.ndarray, "2 K"]]
+    derivatives: Callable[[Float[Tensor, "P V 3"], Float[Tensor, "K P V 3"], int], Float[np.ndarray, "2 K"]]
 
 
 @dataclass(frozen=True)
@@ -76,46 +76,54 @@ def noise_workload(rig: Rig) -> Workload:
 
 def contenders(workload: Workload) -> list[Contender]:
     """All settings of the surface renderer, and `direct_projective`."""
-    return [*(_surface(workload, *settings) for settings in (*SETTINGS, ONE_PER_PIXEL)), _direct_projective(workload)]
+    swept = [surface_contender(workload, *settings) for settings in (*SETTINGS, ONE_PER_PIXEL)]
+    return [*swept, projective_contender(workload)]
 
 
-def _surface(workload: Workload, samples: int, per_edge: int) -> Contender:
+def surface_contender(workload: Workload, samples: int, per_edge: int) -> Contender:
+    """The surface renderer with the given samples a pixel and, on average, a contour edge."""
     renderer = SurfaceRenderer(workload.rig.topology, workload.width, workload.height, samples, per_edge)
-    weights, seed = workload.weights, iter(range(1, 2**31))
-
-    def draw(seed: int) -> tuple[Tensor, Tensor, Tensor]:
-        vertices, textures = workload.vertices.clone().requires_grad_(), workload.textures.clone().requires_grad_()
-        radiance, mask = renderer.render(vertices, textures, workload.cameras, seed=seed)
-        return vertices, (radiance * weights[:, :3]).sum(), (mask * weights[:, 3:]).sum()
+    seeds = iter(range(1, 2**31))
 
     def render() -> None:
-        _, of_radiance, of_mask = draw(next(seed))
-        (of_radiance + of_mask).backward()
+        vertices, textures = workload.vertices.clone().requires_grad_(), workload.textures.clone().requires_grad_()
+        sum(linear_losses(renderer, workload, vertices, textures, next(seeds))).backward()
 
-    def derivatives(motions: Float[Tensor, "K P V 3"], seed: int) -> Float[np.ndarray, "2 K"]:
+    def derivatives(vertices: Float[Tensor, "P V 3"], motions: Float[Tensor, "K P V 3"], seed: int) -> Float[np.ndarray, "2 K"]:
         rows = []
         for part in range(2):  # a render each: one backward pass may follow it
-            vertices, *losses = draw(2 * seed + part)
-            losses[part].backward()
-            rows.append(torch.einsum("pvc,kpvc->k", vertices.grad.double(), motions.double()).numpy())
+            moved = vertices.clone().requires_grad_()
+            linear_losses(renderer, workload, moved, workload.textures, 2 * seed + part)[part].backward()
+            rows.append(torch.einsum("pvc,kpvc->k", moved.grad.double(), motions.double()).numpy())
         return np.stack(rows)
 
     return Contender(f"{samples}, {per_edge}", render, derivatives)
 
 
-def _direct_projective(workload: Workload) -> Contender:
+def linear_losses(
+    renderer: SurfaceRenderer, workload: Workload, vertices: Float[Tensor, "P V 3"], textures: Float[Tensor, "B 3 h w"], seed: int
+) -> tuple[Tensor, Tensor]:
+    """The radiance's and the mask's part of the workload's loss."""
+    radiance, mask = renderer.render(vertices, textures, workload.cameras, seed=seed)
+    return (radiance * workload.weights[:, :3]).sum(), (mask * workload.weights[:, 3:]).sum()
+
+
+def projective_contender(workload: Workload) -> Contender:
+    """Mitsuba's `direct_projective`; it has no mask."""
     peer = DirectProjective(workload)
 
-    def derivatives(motions: Float[Tensor, "K P V 3"], seed: int) -> Float[np.ndarray, "2 K"]:
+    def derivatives(vertices: Float[Tensor, "P V 3"], motions: Float[Tensor, "K P V 3"], seed: int) -> Float[np.ndarray, "2 K"]:
+        peer.place(vertices)
         peer.seed = 1000 * seed
-        gradient = peer.vertex_gradients().double()
-        return np.stack([torch.einsum("pvc,kpvc->k", gradient, motions.double()).numpy(), np.full(len(motions), np.nan)])
+        along = torch.einsum("pvc,kpvc->k", peer.vertex_gradients().double(), motions.double()).numpy()
+        return np.stack([along, np.full(len(motions), np.nan)])
 
     return Contender("direct_projective", peer.forward_and_backward, derivatives)
 
 
-def measure_noise(contender: Contender, motions: Float[Tensor, "K P V 3"], repeats: int, milliseconds: float) -> NoiseRow:
+def measure_noise(contender: Contender, workload: Workload, repeats: int, milliseconds: float) -> NoiseRow:
     """Deviations over `repeats` seeds, beside the time that a call takes."""
-    samples = np.stack([contender.derivatives(motions, seed) for seed in range(1, repeats + 1)])
+    motions = body_motions(workload.vertices)
+    samples = np.stack([contender.derivatives(workload.vertices, motions, seed) for seed in range(1, repeats + 1)])
     deviation = np.sqrt((samples.std(axis=0, ddof=1) ** 2).mean(axis=1)) / np.abs(samples.mean(axis=0)).max(axis=1)
     return NoiseRow(contender.name, float(deviation[0]), float(deviation[1]), milliseconds)

@@ -79,15 +79,6 @@ def finite_difference(renderer: SurfaceRenderer, setup: Setup, directions: Tenso
     return Estimate.of(samples)
 
 
-def body_motions(vertices: Tensor) -> Tensor:
-    """Directions [4, P, V, 3]: translation along x, along z, rotation about the vertical axis, bend of the upper half sideways."""
-    x, y, z = vertices.unbind(-1)
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    height = (z - z.amin(dim=1, keepdim=True)) / (z.amax() - z.amin())
-    motions = [(one, zero, zero), (zero, zero, one), (-y, x, zero), (height.square(), 0.3 * height.square(), zero)]
-    return torch.stack([torch.stack(motion, dim=-1) for motion in motions])
-
-
 def assert_close(estimate: Estimate, expected: Estimate | np.ndarray, bias: float, noise: float) -> None:
     """Means agree to `bias` of the expected scale, or inside three standard errors, which must themselves be below `noise` of it.
 

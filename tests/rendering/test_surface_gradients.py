@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from mitsuba_avatar.benchmarking.noise import body_motions
 from mitsuba_avatar.body.rig import Topology
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.body.skinning import pose_vertices
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from tests.rendering import meshes, reference
-from tests.rendering.gradients import Setup, assert_close, body_motions, derivatives, finite_difference
+from tests.rendering.gradients import Setup, assert_close, derivatives, finite_difference
 
 EXACT_FILM = (26, 20)
 FILM = (60, 80)

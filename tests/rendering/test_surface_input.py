@@ -78,7 +78,7 @@ class TestMessages:
             renderer.render(vertices, meshes.waves(2, 16, 20), cameras)
 
     def test_sizes_and_samples_below_one(self, scene):
-        with pytest.raises(ValueError, match="must be at least 1; got 30, 0, 1, 2"):
+        with pytest.raises(ValueError, match="must be at least 1; got 30, 0, 1, 4"):
             SurfaceRenderer(scene[1], 30, 0)
 
 
