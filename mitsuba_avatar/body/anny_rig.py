@@ -4,7 +4,7 @@
 +X, feet on z = 0, metres. The rest pose is Anny's own: arms lowered by 45 degrees, elbows bent. Facial movement is no joint but 52
 ARKit-style facial actions, linear displacements of the rest vertices.
 
-Building takes about a minute the first time Anny runs on a machine; the rig is kept in `cache_folder()` and read from there.
+Building takes half a minute the first time Anny runs on a machine; the rig is kept in `cache_folder()` and read from there.
 """
 
 import hashlib
@@ -21,6 +21,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from mitsuba_avatar.body.anatomy import RestSkeleton, anny_dof_table
+from mitsuba_avatar.body.anny_files import load_anny
 from mitsuba_avatar.body.mesh import vertex_normals
 from mitsuba_avatar.body.rig import Rig, Topology, load_rig, save_rig
 from mitsuba_avatar.files import atomic_path, cache_folder
@@ -69,7 +70,7 @@ def build_anny_rig(phenotype: AnnyPhenotype = AnnyPhenotype()) -> Rig:  # noqa: 
             return load_rig(path)
         except ValueError:
             path.unlink()  # a damaged cache is rebuilt
-    rig = _build(_load_anny(), phenotype)
+    rig = _build(load_anny("all"), phenotype)
     save_rig(path, rig)
     return rig
 
@@ -91,7 +92,7 @@ def facial_action_displacements() -> tuple[tuple[str, ...], Float32[np.ndarray, 
                 return tuple(str(name) for name in stored["names"]), stored["displacements"]
         except (ValueError, KeyError, EOFError, zipfile.BadZipFile):
             path.unlink()
-    names, displacements = _facial_actions(_load_anny())
+    names, displacements = _facial_actions(load_anny("all"))
     with atomic_path(path) as temporary:
         np.savez_compressed(temporary, names=np.array(names), displacements=displacements)
     return names, displacements
@@ -101,13 +102,6 @@ def _cache_path(kind: str, phenotype: AnnyPhenotype | None) -> Path:
     version = importlib.metadata.version("anny")
     shape = "" if phenotype is None else "_" + hashlib.sha256(repr(astuple(phenotype)).encode()).hexdigest()[:8]
     return cache_folder() / f"anny_{version}_{kind}_{BUILD_VERSION}{shape}.npz"
-
-
-def _load_anny() -> "Anny":
-    from anny import Anny  # slow to import and load: only where a rig is built
-
-    # Plain skinning: ours is used for posing, and Anny's default would start NVIDIA Warp.
-    return Anny(facial_actions="all", skinning_method="lbs")
 
 
 def _build(anny: "Anny", phenotype: AnnyPhenotype) -> Rig:

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
+from mitsuba_avatar.body.anny_files import load_anny
 from mitsuba_avatar.body.anny_rig import AnnyPhenotype
 from mitsuba_avatar.body.rig import Rig
 
@@ -66,10 +67,7 @@ class AnnyShapes:
     """Evaluates Anny's rest shape; loading takes a few seconds."""
 
     def __init__(self) -> None:
-        from anny import Anny  # slow to import and load: only where a shape is searched
-
-        # Plain skinning, as for the rig: Anny's default would start NVIDIA Warp.
-        self._anny = Anny(facial_actions="none", skinning_method="lbs")
+        self._anny = load_anny("none")
 
     def tangent(self, phenotype: AnnyPhenotype) -> ShapeTangent:
         """Value and derivatives at a phenotype: central differences, one-sided at the ends of 0..1."""

@@ -12,7 +12,7 @@ def small_rig():
 
 @pytest.fixture(scope="session")
 def anny_rig():
-    """The default person; built once into the cache folder (a minute where Anny has never run)."""
+    """The default person; built once into the cache folder (half a minute where Anny has never run)."""
     from mitsuba_avatar.body.anny_rig import build_anny_rig
 
     return build_anny_rig()

@@ -174,7 +174,7 @@ def test_a_damaged_cache_is_rebuilt(anny_rig, tmp_path, monkeypatch):
     from mitsuba_avatar.body import anny_rig as module
 
     monkeypatch.setenv("MITSUBA_AVATAR_CACHE", str(tmp_path))
-    monkeypatch.setattr(module, "_load_anny", lambda: None)
+    monkeypatch.setattr(module, "load_anny", lambda facial_actions: None)
     monkeypatch.setattr(module, "_build", lambda anny, phenotype: anny_rig)
     path = module._cache_path("rig", AnnyPhenotype())
     path.write_bytes(b"half a file")
