@@ -15,7 +15,7 @@ from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.filming import cloth_simulation
 from mitsuba_avatar.filming.film import CONTACT_SHEET, default_capture_path, film_capture
 from mitsuba_avatar.filming.performance import Performance
-from mitsuba_avatar.filming.plan import Shard
+from mitsuba_avatar.filming.plan import Shard, plan_filming
 from mitsuba_avatar.filming.settings import StudioSettings
 from tests.filming.acted import Acted
 
@@ -25,6 +25,12 @@ def folder(settings: StudioSettings, tmp_path_factory: pytest.TempPathFactory) -
     path = tmp_path_factory.mktemp("studio") / "tiny"
     film_capture(settings, path)
     return path
+
+
+@pytest.fixture(scope="module")
+def displaced(settings: StudioSettings, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """A shorter capture in displaced clothes; not to be written to."""
+    return film_capture(_displaced(settings), tmp_path_factory.mktemp("displaced") / "tiny")
 
 
 def _files(folder: Path) -> dict[str, bytes]:
@@ -72,12 +78,9 @@ def test_the_template_fits_better_dressed_than_bare(folder: Path, performance: A
     assert np.median(offsets) < 0.003
 
 
-def test_the_same_settings_give_the_same_capture(folder: Path, settings: StudioSettings, tmp_path: Path):
-    film_capture(settings, tmp_path / "again")
-    assert _files(folder) == _files(tmp_path / "again")
-
-
 def test_interrupted_filming_goes_on_where_it_stopped(folder: Path, settings: StudioSettings, tmp_path: Path):
+    """And the same settings, in another folder and in two runs, give the same bytes."""
+
     def interrupt(stage: str, done: int, total: int) -> None:
         if (stage, done) == ("filming", 5):
             raise KeyboardInterrupt
@@ -94,13 +97,11 @@ def test_interrupted_filming_goes_on_where_it_stopped(folder: Path, settings: St
     assert _files(tmp_path / "part") == _files(folder)
 
 
-def test_shards_in_any_order_make_the_whole(settings: StudioSettings, tmp_path: Path):
+def test_shards_in_any_order_make_the_whole(displaced: Capture, settings: StudioSettings, tmp_path: Path):
     """Three processes' shares, the last first, give the files of one run; only the one that finds nothing missing finishes."""
-    short = _displaced(settings)
-    film_capture(short, tmp_path / "whole")
-    results = [film_capture(short, tmp_path / "shared", shard=Shard(index, 3)) for index in (2, 0, 1)]
+    results = [film_capture(_displaced(settings), tmp_path / "shared", shard=Shard(index, 3)) for index in (2, 0, 1)]
     assert results[:2] == [None, None] and results[2] is not None
-    assert _files(tmp_path / "shared") == _files(tmp_path / "whole")
+    assert _files(tmp_path / "shared") == _files(displaced.path)
 
 
 def test_only_segments_that_a_shard_shows_are_simulated(settings: StudioSettings, tmp_path: Path):
@@ -118,27 +119,25 @@ def test_a_garment_that_explodes_is_never_filmed(settings: StudioSettings, tmp_p
     assert not list((tmp_path / "capture").rglob("*.png")) and not list((tmp_path / "capture").rglob("garment_vertices/*"))
 
 
-def test_tracking_noise_is_in_the_capture_and_the_truth_beside_it(settings: StudioSettings, tmp_path: Path):
-    exact = film_capture(_displaced(settings), tmp_path / "exact")
+def test_tracking_noise_is_in_the_capture_and_the_truth_beside_it(displaced: Capture, settings: StudioSettings, tmp_path: Path):
     noisy = film_capture(_displaced(settings, tracking_noise=0.004), tmp_path / "noisy")
     truth = np.load(tmp_path / "noisy" / "truth" / "vertices.npy")
-    np.testing.assert_array_equal(truth, exact.vertices)
+    np.testing.assert_array_equal(truth, displaced.vertices)
     error = np.linalg.norm(noisy.vertices - truth, axis=-1)
     assert np.sqrt((error**2).mean()) == pytest.approx(0.004, rel=0.02)
-    assert not (tmp_path / "exact" / "truth" / "vertices.npy").exists()
-    np.testing.assert_array_equal(noisy.encoded_image("train_01", 2), exact.encoded_image("train_01", 2))
+    assert not (displaced.path / "truth" / "vertices.npy").exists()
+    np.testing.assert_array_equal(noisy.encoded_image("train_01", 2), displaced.encoded_image("train_01", 2))
 
 
-def test_the_unmatched_settings_are_the_same_person_otherwise(settings: StudioSettings, tmp_path: Path):
+def test_the_unmatched_settings_are_the_same_person_otherwise(displaced: Capture, settings: StudioSettings, tmp_path: Path):
     """A headset hides the upper face, whose signal comes as codes; the skeleton and the cameras' places are those of the plain capture."""
-    plain = film_capture(_displaced(settings), tmp_path / "plain")
     codes = dataclasses.replace(_displaced(settings, headset=True, attire="leafy"))
     codes = dataclasses.replace(codes, motion=dataclasses.replace(codes.motion, face_signal="action_codes"))
     other = film_capture(codes, tmp_path / "other")
-    np.testing.assert_array_equal(other.theta, plain.theta)
+    np.testing.assert_array_equal(other.theta, displaced.theta)
     assert other.description.face_signal == "action_codes" and other.face.shape[1] == 52 == len(other.description.face_names)
     np.testing.assert_array_equal(other.face, np.load(tmp_path / "other" / "truth" / "actions.npy"))
-    changed = (other.encoded_image("train_00", 0) != plain.encoded_image("train_00", 0)).any(axis=-1)
+    changed = (other.encoded_image("train_00", 0) != displaced.encoded_image("train_00", 0)).any(axis=-1)
     assert 0.02 < changed.mean() < 0.6
 
 
@@ -147,6 +146,11 @@ def test_figures_of_the_capture_are_kept(folder: Path):
     assert (info["frames"], info["cameras"], info["images"]) == (12, 4, 48)
     assert info["hidden_mm"] == pytest.approx(min(info["hidden_state"]["linear"]["rms_mm"], info["hidden_state"]["nearest"]["rms_mm"]))
     assert info["seconds"] > 0 and set(info["test_pose_distance_deg"]) == {"test_recombined", "test_conversation"}
+
+
+def test_the_capture_takes_the_room_that_was_planned(folder: Path, settings: StudioSettings):
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    assert size == pytest.approx(plan_filming(settings).bytes, rel=0.5)
 
 
 def test_the_truth_holds_what_made_the_images(folder: Path, settings: StudioSettings, simulated: Performance):

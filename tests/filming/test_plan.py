@@ -1,8 +1,10 @@
 """Shards cover a capture without overlap; plans count what will be filmed."""
 
+import dataclasses
+
 import pytest
 
-from mitsuba_avatar.filming.plan import Shard, plan_filming
+from mitsuba_avatar.filming.plan import FilmingPlan, Shard, plan_filming
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.presets import resolve
 
@@ -36,8 +38,41 @@ def test_the_plan_of_the_papers_size_counts_seven_million_images():
     assert "7,000,000 images" in plan.text() and "days" in plan.text()
 
 
-def test_cost_grows_with_frames_cameras_and_pixels():
-    small = plan_filming(resolve("studio/tiny", kind=StudioSettings))
-    default = plan_filming(resolve("studio/default", kind=StudioSettings))
-    study = plan_filming(resolve("studio/study", kind=StudioSettings))
-    assert small.seconds < default.seconds < study.seconds and small.bytes < default.bytes < study.bytes
+def planned(**changes: dict[str, object]) -> FilmingPlan:
+    """The plan of the tiny preset with changes to some of its groups of settings."""
+    settings = resolve("studio/tiny", kind=StudioSettings)
+    return plan_filming(
+        dataclasses.replace(settings, **{name: dataclasses.replace(getattr(settings, name), **values) for name, values in changes.items()})
+    )
+
+
+def test_cost_is_proportional_to_frames():
+    once, thrice = planned(), planned(motion={"train_frames": 24, "test_frames": 12})
+    assert (once.frames, thrice.frames) == (12, 36)
+    assert thrice.seconds == pytest.approx(3 * once.seconds) and thrice.bytes == pytest.approx(3 * once.bytes)
+
+
+@pytest.mark.parametrize(
+    ("more", "much_more"),
+    [
+        ({"cameras": {"train": 5}}, {"cameras": {"train": 7}}),
+        ({"cameras": {"held_out": 2}}, {"cameras": {"held_out": 3}}),
+        ({"cameras": {"width": 80}}, {"cameras": {"width": 120}}),
+        ({"cameras": {"height": 112}}, {"cameras": {"height": 168}}),
+        ({"light": {"samples_per_pixel": 9}}, {"light": {"samples_per_pixel": 14}}),
+        ({"light": {"light_samples": 2}}, {"light": {"light_samples": 3}}),
+    ],
+)
+def test_each_step_of_cameras_pixels_and_samples_costs_the_same(more: dict, much_more: dict):
+    """Samples cost time and no room on the disk; what a frame costs by itself stays."""
+    first, second, third = planned(), planned(**more), planned(**much_more)
+    assert second.seconds > first.seconds
+    assert third.seconds - first.seconds == pytest.approx(2 * (second.seconds - first.seconds))
+    assert third.bytes - first.bytes == pytest.approx(2 * (second.bytes - first.bytes))
+    assert (second.bytes > first.bytes) == ("cameras" in more)
+
+
+def test_simulated_clothes_cost_time():
+    assert planned(clothing={"is_simulated": False}).seconds < planned().seconds
+    slow, fast = (planned(motion={"fps": fps}).seconds for fps in (10.0, 20.0))
+    assert fast < slow, "a frame stands for less time to simulate"
