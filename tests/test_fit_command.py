@@ -44,7 +44,7 @@ def test_a_short_fit_reduces_the_error_of_held_out_cameras(fitted_run):
     """Against the untrained avatar, which is the posed template with the mean texture: on poses and cameras it never saw."""
     means = load_metrics(fitted_run / "metrics.json")
     trained, untrained = (means[method]["test"]["held_out"] for method in ("avatar", "template_mean_texture"))
-    assert trained["psnr"] > untrained["psnr"] + 1.0
+    assert trained["psnr"] > untrained["psnr"] + 0.5
     assert trained["l1"] < 0.85 * untrained["l1"] and trained["mse"] < 0.8 * untrained["mse"]
     assert trained["vertex_mm"] < untrained["vertex_mm"]
 
