@@ -98,7 +98,7 @@ class Fit:
             avatar = run.load_avatar("last").train()
         else:
             with progress_bar("mean texture", 1, is_shown=process.is_main) as bar:
-                statistics = training_statistics(capture, rig, settings.model.texture_size, bar.update)
+                statistics = training_statistics(capture, rig, settings.model.texture_size, bar.update, settings.loss.looks_at_images)
             torch.manual_seed(settings.training.seed)
             avatar = Avatar(rig, settings.model, statistics)
             face_size = capture.face.shape[1]
@@ -108,8 +108,9 @@ class Fit:
                 run = RunFolder(path, settings, rig, capture.path, face_size)
         avatar = avatar.to("cuda" if is_on_gpu else "cpu")
         occlusion = frame_occlusion(settings, rig, avatar, capture)
-        with progress_bar("ambient occlusion", len(capture.frames), is_shown=process.is_main) as bar:
-            occlusion.bake(bar.update)
+        if settings.loss.looks_at_images:
+            with progress_bar("ambient occlusion", len(capture.frames), is_shown=process.is_main) as bar:
+                occlusion.bake(bar.update)
         reader = FrameReader(capture, occlusion)
         trainer = Trainer(avatar, rig, reader, settings, process)
         if is_resumed:
@@ -118,7 +119,7 @@ class Fit:
 
     def train(self) -> bool:
         """Train to the end; False if the user stopped it, with everything saved."""
-        training = self.settings.training
+        training, draws = self.settings.training, self.settings.loss.looks_at_images
         trainer, is_main = self.trainer, self.process.is_main
         evaluator, presentation = self._tools(samples_per_pixel=4)
         shots = self._preview_shots()
@@ -135,7 +136,7 @@ class Fit:
                 bar.update(iteration, **terms)
                 is_last = iteration == training.iterations or is_stopping
                 psnr = None
-                if iteration % training.validate_every == 0 or is_last:
+                if draws and (iteration % training.validate_every == 0 or is_last):
                     psnr = self._validate(evaluator)
                 if iteration % LOG_EVERY == 0 or psnr is not None:
                     record = {"iteration": iteration, **terms, "learning_rate": trainer.learning_rate(iteration - 1)}
@@ -147,7 +148,7 @@ class Fit:
                         | ({} if psnr is None else {"validation_psnr": psnr})
                         | ({"skipped": skipped, "skipped_in_all": trainer.guard.num_skipped} if skipped else {})
                     )
-                if iteration % training.preview_every == 0 or is_last:
+                if draws and (iteration % training.preview_every == 0 or is_last):
                     save_image(self.run.previews / f"{iteration:06d}.png", presentation.preview(shots))
                 if iteration % training.checkpoint_every == 0 or is_last:
                     trainer.save(self.run.checkpoints, psnr)

@@ -136,6 +136,11 @@ class LossSettings:
         expect(self, "zero or more", "image", "mask", "geometry", "laplacian", "kl", "geometry_iterations", "geometry_after")
         expect(self, "zero or more", "mutual_information", "perturbation")
 
+    @property
+    def looks_at_images(self) -> bool:
+        """Whether a fit learns from pictures; otherwise from registered meshes alone, as a rehearsal does, and no image is read."""
+        return self.image > 0 or self.mask > 0
+
 
 @dataclass(frozen=True)
 class DisentanglementSettings:

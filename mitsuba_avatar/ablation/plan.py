@@ -42,11 +42,6 @@ class PlannedRun:
         return self.measures_path.is_file()
 
     @property
-    def looks_at_images(self) -> bool:
-        """Whether it learns from pictures; a rehearsal learns from registered meshes alone."""
-        return self.settings.loss.image > 0 or self.settings.loss.mask > 0
-
-    @property
     def is_begun(self) -> bool:
         """Whether there is a checkpoint to go on from."""
         return (self.path / "checkpoints" / "checkpoints.json").is_file()

@@ -57,7 +57,7 @@ def _work(run: PlannedRun) -> int:
         "training_seconds": seconds,
         "parameters": sum(parameter.numel() for parameter in avatar.parameters()),
     }
-    if run.looks_at_images:
+    if run.settings.loss.looks_at_images:
         samples = run.settings.evaluation.samples_per_pixel
         renderer = SurfaceRenderer(fit.run.rig.topology, fit.reader.width, fit.reader.height, samples)
         splits = Splits.of(fit.capture, most)

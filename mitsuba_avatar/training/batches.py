@@ -5,7 +5,7 @@ take disjoint slices of one global batch. Symbols: P poses, N views a pose, B = 
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -27,17 +27,17 @@ AHEAD = 2  # batches decoded in advance: enough to hide the disk, little memory
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """P poses, N views each; images are pose-major.
+    """P poses, N views each; images are pose-major. What only pictures need is None where none were read (`FrameReader.read_surfaces`).
 
     Attributes:
         frames: P frame indices.
         camera_names: P lists of N names.
         theta: [P, D] radians. root: [P, 4, 4]. face: [P, F].
         vertices: [P, V, 3] registered mesh, metres; None where the capture has none.
-        ambient_occlusion: [P, 1, S, S].
-        images: [B, 3, H, W] display-encoded (sRGB), as losses and metrics compare them. masks: [B, 1, H, W].
-        backgrounds: [B, 3, H, W] linear radiance.
-        cameras: B cameras.
+        ambient_occlusion: [P, 1, S, S]; None without pictures.
+        images: [B, 3, H, W] display-encoded (sRGB), as losses and metrics compare them. masks: [B, 1, H, W]. None without pictures.
+        backgrounds: [B, 3, H, W] linear radiance; None without pictures.
+        cameras: B cameras; None without pictures.
     """
 
     frames: list[int]
@@ -46,11 +46,11 @@ class FrameBatch:
     root: Float[Tensor, "P 4 4"]
     face: Float[Tensor, "P F"]
     vertices: Float[Tensor, "P V 3"] | None
-    ambient_occlusion: Float[Tensor, "P 1 S S"]
-    images: Float[Tensor, "B 3 H W"]
-    masks: Float[Tensor, "B 1 H W"]
-    backgrounds: Float[Tensor, "B 3 H W"]
-    cameras: CameraBatch
+    ambient_occlusion: Float[Tensor, "P 1 S S"] | None = None
+    images: Float[Tensor, "B 3 H W"] | None = None
+    masks: Float[Tensor, "B 1 H W"] | None = None
+    backgrounds: Float[Tensor, "B 3 H W"] | None = None
+    cameras: CameraBatch | None = None
 
     @property
     def camera_centers(self) -> Float[Tensor, "P N 3"]:
@@ -62,6 +62,9 @@ class FrameBatch:
         tensors = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         moved = {name: value.to(device) for name, value in tensors.items() if isinstance(value, Tensor)}
         return dataclasses.replace(self, **moved)
+
+
+BatchReader = Callable[[list[int], list[list[str]]], FrameBatch]  # from frames and the names of the cameras that see each
 
 
 class FrameReader:
@@ -93,6 +96,18 @@ class FrameReader:
                 masks.append(mask)
                 backgrounds.append(background)
                 cameras.append(capture.cameras[name])
+        return dataclasses.replace(
+            self.read_surfaces(frames, camera_names),
+            ambient_occlusion=self.occlusion.maps(frames),
+            images=_channels_first(images),
+            masks=torch.from_numpy(np.stack(masks))[:, None],
+            backgrounds=_channels_first(backgrounds),
+            cameras=CameraBatch.from_cameras(cameras),
+        )
+
+    def read_surfaces(self, frames: list[int], camera_names: list[list[str]]) -> FrameBatch:
+        """The same batch without what only pictures need; opens no image and bakes no occlusion."""
+        capture = self.capture
         return FrameBatch(
             frames=frames,
             camera_names=camera_names,
@@ -100,11 +115,6 @@ class FrameReader:
             root=_rows(capture.root, frames),
             face=_rows(capture.face, frames),
             vertices=None if capture.vertices is None else _rows(capture.vertices, frames),
-            ambient_occlusion=self.occlusion.maps(frames),
-            images=_channels_first(images),
-            masks=torch.from_numpy(np.stack(masks))[:, None],
-            backgrounds=_channels_first(backgrounds),
-            cameras=CameraBatch.from_cameras(cameras),
         )
 
 
@@ -200,14 +210,20 @@ def training_sampler(capture: Capture, training: TrainingSettings, process: Proc
     )
 
 
-def batches(reader: FrameReader, sampler: BatchSampler, start: int, stop: int) -> Iterator[FrameBatch]:
-    """Batches of iterations start..stop-1, in order; a thread decodes the next ones meanwhile (image decoding releases Python's lock)."""
+def batches(read: BatchReader, sampler: BatchSampler, start: int, stop: int) -> Iterator[FrameBatch]:
+    """Batches of iterations start..stop-1, in order; a thread decodes the next ones meanwhile (image decoding releases Python's lock).
+
+    Args:
+        read: `FrameReader.read`, or `FrameReader.read_surfaces`.
+        sampler: what each iteration sees.
+        start, stop: iterations.
+    """
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="batches") as pool:
         waiting: list[Future[FrameBatch]] = []
         try:
             for iteration in range(start, stop):
                 while len(waiting) < AHEAD and iteration + len(waiting) < stop:
-                    waiting.append(pool.submit(reader.read, *sampler.draw(iteration + len(waiting))))
+                    waiting.append(pool.submit(read, *sampler.draw(iteration + len(waiting))))
                 yield waiting.pop(0).result()
         finally:
             for future in waiting:

@@ -102,7 +102,8 @@ class Trainer:
             DivergedError: too many bad steps; single ones are skipped, and after_step gets the terms of the last good one.
         """
         terms: dict[str, float] = {}
-        with closing(batches(self.reader, self.sampler, self.iteration, self.settings.training.iterations)) as stream:
+        read = self.reader.read if self.settings.loss.looks_at_images else self.reader.read_surfaces
+        with closing(batches(read, self.sampler, self.iteration, self.settings.training.iterations)) as stream:
             while self.iteration < self.settings.training.iterations:
                 with self.timer.part("data"):
                     batch = next(stream)

@@ -40,7 +40,7 @@ def check_trainable(capture: Capture, settings: Settings, process: Process) -> N
             f"check_trainable(): expected registered meshes for the encoder in {capture.path / 'vertices.npy'}; got none. "
             "Add the file, or set model.use_latent false."
         )
-    if settings.loss.image == 0 and settings.loss.mask == 0:
+    if not settings.loss.looks_at_images:
         if capture.vertices is None:
             raise FileNotFoundError(
                 f"check_trainable(): expected registered meshes in {capture.path / 'vertices.npy'}, because loss.image and loss.mask "

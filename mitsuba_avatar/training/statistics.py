@@ -16,10 +16,15 @@ from mitsuba_avatar.training.batches import composited
 
 MESHES = 64  # frames whose mesh enters the mean shape
 TEXTURES = 24  # frames whose images enter the mean texture
+GREY = 0.5  # radiance of a surface that no image was read for
 
 
 def training_statistics(
-    capture: Capture, rig: Rig, texture_size: int, progress: Callable[[int, int], None] = lambda done, total: None
+    capture: Capture,
+    rig: Rig,
+    texture_size: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    with_texture: bool = True,
 ) -> DrivingStatistics:
     """Means and deviations over the training split, seen by the training cameras; held-out images are never read.
 
@@ -28,12 +33,12 @@ def training_statistics(
         rig: of the capture.
         texture_size: texels of the mean texture.
         progress: called as progress(done, total).
+        with_texture: whether the mean texture is gathered from the images; otherwise it is grey, and no image is read.
     """
     frames = capture.frame_indices("train")
     theta, face = np.asarray(capture.theta[frames], np.float64), np.asarray(capture.face[frames], np.float64)
     skeleton = Skeleton(rig)
     weights = torch.from_numpy(rig.skinning_weights)
-    total = TEXTURES if len(frames) > TEXTURES else len(frames)
 
     displacement = torch.zeros(rig.topology.num_vertices, 3, dtype=torch.float64)
     if capture.vertices is not None:
@@ -43,10 +48,24 @@ def training_statistics(
             displacement += unpose_vertices(_row(capture.vertices, i), posed_from_rest, weights)[0] - torch.from_numpy(rig.rest_vertices)
         displacement /= len(chosen)
 
+    texture = _mean_texture(capture, rig, texture_size, progress) if with_texture else torch.full((3, texture_size, texture_size), GREY)
+    return DrivingStatistics(
+        theta_mean=torch.from_numpy(theta.mean(0)).float(),
+        theta_std=torch.from_numpy(theta.std(0)).float(),
+        face_mean=torch.from_numpy(face.mean(0)).float(),
+        face_std=torch.from_numpy(face.std(0)).float(),
+        mean_texture=texture,
+        mean_displacement=displacement.float(),
+    )
+
+
+def _mean_texture(capture: Capture, rig: Rig, texture_size: int, progress: Callable[[int, int], None]) -> torch.Tensor:
+    """[3, T, T] radiance that training frames show on the surface, mean over frames and training cameras."""
+    skeleton, frames = Skeleton(rig), evenly_spaced(capture.frame_indices("train"), TEXTURES)
     projection = TextureProjection(rig.topology, texture_size)
     names = capture.camera_names(held_out=False)
     cameras = CameraBatch.from_cameras([capture.cameras[name] for name in names])
-    for done, i in enumerate(evenly_spaced(frames, TEXTURES)):
+    for done, i in enumerate(frames):
         masks = [capture.mask(name, i) for name in names]
         images = [composited(capture.image(name, i), mask, capture.background(name)) for name, mask in zip(names, masks, strict=True)]
         projection.add(
@@ -55,15 +74,8 @@ def training_statistics(
             torch.from_numpy(np.stack(masks))[:, None],
             cameras,
         )
-        progress(done + 1, total)
-    return DrivingStatistics(
-        theta_mean=torch.from_numpy(theta.mean(0)).float(),
-        theta_std=torch.from_numpy(theta.std(0)).float(),
-        face_mean=torch.from_numpy(face.mean(0)).float(),
-        face_std=torch.from_numpy(face.std(0)).float(),
-        mean_texture=projection.mean(),
-        mean_displacement=displacement.float(),
-    )
+        progress(done + 1, len(frames))
+    return projection.mean()
 
 
 def registered_vertices(capture: Capture, rig: Rig, skeleton: Skeleton, frame_index: int) -> torch.Tensor:

@@ -83,6 +83,17 @@ def test_a_batch_holds_what_the_files_say(reader, drawn_capture):
     assert torch.equal(batch.ambient_occlusion, reader.occlusion.maps(frames)) and batch.ambient_occlusion.std() > 0.01
 
 
+def test_surfaces_are_read_without_images_and_occlusion(reader, monkeypatch):
+    frames, names = [5, 2], [["left", "front"], ["back", "left"]]
+    whole = reader.read(frames, names)
+    monkeypatch.setattr(Capture, "mask", None)
+    monkeypatch.setattr(reader, "occlusion", None)
+    batch = reader.read_surfaces(frames, names).to(torch.device("cpu"))
+    assert (batch.frames, batch.camera_names) == (frames, names)
+    assert all(torch.equal(getattr(batch, name), getattr(whole, name)) for name in ("theta", "root", "face", "vertices"))
+    assert all(getattr(batch, name) is None for name in ("images", "masks", "backgrounds", "cameras", "ambient_occlusion"))
+
+
 def test_images_over_an_unknown_background_are_put_on_black(reader, drawn_capture, tmp_path):
     shutil.copytree(drawn_capture.path, tmp_path / "copy")
     description = (tmp_path / "copy/capture.yaml").read_text().splitlines()
@@ -116,7 +127,7 @@ def threads():
 
 def test_batches_come_in_order_and_only_a_few_ahead(reader):
     recording, sampler = RecordingReader(reader), training_sampler(reader.capture, resolve("tiny").training, Process())
-    stream = batches(recording, sampler, 3, 9)
+    stream = batches(recording.read, sampler, 3, 9)
     for iteration in range(3, 9):
         batch = next(stream)
         assert (batch.frames, batch.camera_names) == sampler.draw(iteration)
@@ -127,7 +138,7 @@ def test_batches_come_in_order_and_only_a_few_ahead(reader):
 
 def test_a_stream_that_is_closed_early_leaves_no_thread(reader):
     recording, sampler = RecordingReader(reader), training_sampler(reader.capture, resolve("tiny").training, Process())
-    stream = batches(recording, sampler, 0, 1000)
+    stream = batches(recording.read, sampler, 0, 1000)
     next(stream)
     assert threads()
     stream.close()
@@ -135,7 +146,7 @@ def test_a_stream_that_is_closed_early_leaves_no_thread(reader):
 
 
 def test_an_image_that_cannot_be_read_stops_at_its_own_iteration(reader):
-    stream = batches(RecordingReader(reader, fail_at=1), training_sampler(reader.capture, resolve("tiny").training, Process()), 0, 5)
+    stream = batches(RecordingReader(reader, fail_at=1).read, training_sampler(reader.capture, resolve("tiny").training, Process()), 0, 5)
     next(stream)
     with pytest.raises(ValueError, match="damaged image"):
         next(stream)

@@ -190,11 +190,12 @@ def test_information_is_observed_and_penalised(make_trainer):
     torch.testing.assert_close(trainer.information.driving[100:102], trainer.avatar.standardized_driving(batch.theta, batch.face))
 
 
-def test_without_image_and_mask_nothing_is_rendered_and_the_surface_learns_alone(make_trainer, monkeypatch):
-    trainer = make_trainer("loss.image=0", "loss.mask=0", "training.learning_rate=5e-3", "training.iterations=1000")
+def test_without_image_and_mask_nothing_is_read_nor_rendered_and_the_surface_learns_alone(make_trainer, reader, monkeypatch):
+    rates = ("training.learning_rate=5e-3", "training.learning_rate_final=5e-3")
+    trainer = make_trainer("loss.image=0", "loss.mask=0", *rates, "training.iterations=30", reader=MemoryReader(reader))
     monkeypatch.setattr(trainer.renderer, "render", None)
-    batch = trainer.reader.read(*trainer.sampler.draw(0))
-    terms = [trainer.step(batch) for _ in range(30)]
+    monkeypatch.setattr(trainer.reader, "read", None)
+    terms = run(trainer)
     assert set(terms[0]) == {"loss", "geometry", "laplacian", "kl"}
     assert terms[-1]["geometry"] < 0.7 * terms[0]["geometry"]
 

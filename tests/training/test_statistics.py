@@ -55,6 +55,14 @@ def test_held_out_cameras_and_test_frames_are_never_read(drawn_capture, rig, sta
         torch.testing.assert_close(getattr(again, name), value)
 
 
+def test_without_a_texture_no_image_is_read_and_the_surface_is_grey(drawn_capture, rig, statistics, monkeypatch):
+    monkeypatch.setattr(Capture, "mask", None)
+    shape_alone = training_statistics(drawn_capture, rig, 32, with_texture=False)
+    assert shape_alone.mean_texture.shape == (3, 32, 32) and bool((shape_alone.mean_texture == 0.5).all())
+    torch.testing.assert_close(shape_alone.mean_displacement, statistics.mean_displacement)
+    torch.testing.assert_close(shape_alone.face_std, statistics.face_std)
+
+
 def test_without_registered_meshes_the_rest_shape_stands_in(drawn_capture, rig, statistics, tmp_path):
     shutil.copytree(drawn_capture.path, tmp_path / "copy")
     (tmp_path / "copy/vertices.npy").unlink()
