@@ -1,5 +1,9 @@
 """The encoder: from the registered mesh of a frame to a Gaussian over the latent code z. Used in training only.
 
+Its last layer begins small, so that the posterior begins near the prior, and is scaled by the root of its inputs ("equalized learning
+rate", arXiv:1710.10196). Adam moves every one of its thousand weights by the learning rate at each step; unscaled, `logvar` jumps by
+several units at once, exp(logvar) explodes, and at a low KL weight training ends there.
+
 It sees what the driving signal cannot tell: the registered vertices, unposed, minus the template, drawn as a map over the texture
 atlas. Convention of the whole project: `logvar` is the logarithm of the variance, so std = exp(0.5 * logvar).
 
@@ -18,6 +22,7 @@ from mitsuba_avatar.settings import ModelSettings
 # In units of `displacement_scale`. Unposing sends the vertices of a folded joint far away (see body.skinning.unpose_vertices), and one
 # such texel would drown all others; real clothing stays within this.
 LARGEST_OFFSET = 10.0
+HEAD_DEVIATION = 0.1  # of the last layer's weights at first; outputs then deviate by about as much from the prior's mu = logvar = 0
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class Posterior:
 
 
 class Encoder(nn.Module):
-    """Strided convolutions over the map of offsets, halving it once per entry of `encoder_channels`, then one linear layer."""
+    """Strided convolutions over the map of offsets, halving it once per entry of `encoder_channels`, then one scaled linear layer."""
 
     def __init__(self, settings: ModelSettings):
         super().__init__()
@@ -50,6 +55,9 @@ class Encoder(nn.Module):
         self.convolutions = nn.Sequential(*layers)
         smallest = settings.encoder_size >> len(settings.encoder_channels)
         self.head = nn.Linear(previous * smallest**2, 2 * settings.latent_size)
+        self.head_scale = self.head.in_features**-0.5
+        nn.init.normal_(self.head.weight, std=HEAD_DEVIATION)
+        nn.init.zeros_(self.head.bias)
 
     def forward(self, offsets: Float[Tensor, "P 3 S S"]) -> Posterior:
         """Posterior of each pose.
@@ -58,5 +66,5 @@ class Encoder(nn.Module):
             offsets: [P, 3, S, S] unposed registered surface minus template, in units of `displacement_scale`, S = encoder_size.
         """
         features = self.convolutions(channels_last(offsets.clamp(-LARGEST_OFFSET, LARGEST_OFFSET)))
-        mu, logvar = self.head(features.flatten(1)).chunk(2, dim=1)  # [P, Z] each
+        mu, logvar = self.head(self.head_scale * features.flatten(1)).chunk(2, dim=1)  # [P, Z] each
         return Posterior(mu, logvar)
