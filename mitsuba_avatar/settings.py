@@ -12,6 +12,7 @@ _RANGES = {
     "positive": lambda value: value > 0,
     "zero or more": lambda value: value >= 0,
     "between 0 and 1": lambda value: 0 <= value <= 1,
+    "odd": lambda value: value > 0 and value % 2 == 1,
     "a power of two": lambda value: value > 0 and value & (value - 1) == 0,
 }
 
@@ -59,6 +60,7 @@ class ModelSettings:
     pose_embedding_channels: int = 16  # of e_theta
     face_embedding_channels: int = 8  # of e_f
     decoder_channels: tuple[int, ...] = (64, 64)  # trunk: convolutions at conditioning_size, shared by geometry and texture
+    decoder_kernel: int = 3  # width of the trunk's kernels; 1 keeps signals from crossing the borders between charts of the atlas
     geometry_channels: tuple[int, ...] = (24,)  # features at 2x, 4x, ... conditioning_size, up to half of geometry_size
     geometry_size: int = 128  # texels of the displacement map
     texture_channels: tuple[int, ...] = (48, 16)  # features at 2x, 4x, ... conditioning_size, up to half of texture_size
@@ -76,6 +78,7 @@ class ModelSettings:
         expect(self, "positive", "latent_size", "latent_channels", "pose_embedding_channels", "face_embedding_channels")
         expect(self, "positive", "decoder_channels", "geometry_channels", "texture_channels", "view_channels")
         expect(self, "positive", "encoder_channels", "shadow_channels", "displacement_scale", "texture_scale")
+        expect(self, "odd", "decoder_kernel")
         expect(self, "a power of two", "conditioning_size", "geometry_size", "texture_size")
         expect(self, "a power of two", "view_size", "encoder_size", "shadow_downscale")
         for name, least in (("geometry_size", 1), ("texture_size", 2), ("view_size", 1)):

@@ -6,8 +6,10 @@
                                                         +----------> view branch -> what the camera's direction adds
 
 z starts at a tiny map and so reaches the whole output; theta and f enter late, at the conditioning map, and reach only the
-receptive field of what follows. Everything runs once per pose except the view branch, which runs once per pose and camera on
-smaller maps. Every layer has untied biases, and all three outputs are exactly zero before training.
+receptive field of what follows. Charts that are neighbours in the atlas may lie far apart on the body: a trunk of 1x1 kernels
+(`decoder_kernel`) leaves only the doublings to carry a signal across their border. Everything runs once per pose except the view
+branch, which runs once per pose and camera on smaller maps. Every layer has untied biases, and all three outputs are exactly zero
+before training.
 
 Source: arXiv:2105.10441, sections 3.2 to 3.4. The paper publishes no layer sizes; branches and widths are ours.
 """
@@ -138,7 +140,7 @@ class Decoder(nn.Module):
         previous = self.pose_signal.channels + self.face_signal.channels + (settings.latent_channels[-1] if settings.use_latent else 0)
         layers: list[nn.Module] = []
         for width in settings.decoder_channels:
-            layers += [convolution(previous, width, size), nn.LeakyReLU(NEGATIVE_SLOPE)]
+            layers += [convolution(previous, width, size, settings.decoder_kernel), nn.LeakyReLU(NEGATIVE_SLOPE)]
             previous = width
         self.trunk = nn.Sequential(*layers)
         self.geometry = Branch(previous, size, settings.geometry_channels, settings.geometry_size)

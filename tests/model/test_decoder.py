@@ -80,6 +80,21 @@ def test_an_angle_changes_maps_only_within_the_receptive_field_of_its_mask():
         assert difference[inside].all(), name
 
 
+def test_a_trunk_of_single_texels_keeps_an_angle_to_half_a_cell_around_its_mask():
+    """Two 3x3 convolutions carry it two cells on; two of one texel leave the doublings alone, which reach less than one cell."""
+    masks = torch.zeros(2, 8, 8)
+    masks[0, 1:3, 4:6], masks[1, 6, 1] = 1, 1
+    cells = {}
+    for kernel in (1, 3):
+        settings = dataclasses.replace(SMALL, decoder_channels=(4, 5), decoder_kernel=kernel)
+        decoder = make_decoder(settings, masks, torch.ones(1, 8, 8))
+        theta, face, z = torch.randn(2, 2), torch.randn(2, 1), torch.randn(2, 3)
+        moved = decoder.displacement(theta + torch.tensor([1.0, 0.0]), face, z) != decoder.displacement(theta, face, z)
+        rows, columns = (torch.nonzero(moved.flatten(0, 1).any(0).any(axis))[:, 0] for axis in (1, 0))
+        cells[kernel] = [int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())]
+    assert cells == {1: [1, 6, 7, 12], 3: [0, 10, 3, 15]}, "texels of 16x16; the mask covers 2..5 and 8..11"
+
+
 def test_the_latent_code_reaches_every_texel():
     decoder = make_decoder(SMALL, torch.ones(2, 8, 8), torch.ones(1, 8, 8))
     view = torch.randn(2, 1, VIEW_COORDINATES, 16, 16)
