@@ -1,21 +1,25 @@
-"""What an avatar has learnt: `python -m mitsuba_avatar.analyze RUN [--capture DIR] [--out DIR]`.
+"""What an avatar has learnt: `python -m mitsuba_avatar.analyze RUN [--capture DIR] [--drives DIR ...] [--out DIR]`.
 
 Prints, and writes to report.json: how much the latent code says and what it tells about the driving signal, what swaps of codes and of
 driving signals move, chance correlations, distances from the true surface. Draws where controls act, where the avatar is unsure, and what
-inverse rendering gained.
+inverse rendering gained. Captures given with --drives move the avatar, with every imputation of its latent code.
 """
 
 import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from mitsuba_avatar.files import atomic_path, check_writable
 from mitsuba_avatar.progress import StageProgress
 from mitsuba_avatar.rendering import backend
+
+if TYPE_CHECKING:  # these modules load torch and Dr.Jit
+    from mitsuba_avatar.analysis.measures import Study
+    from mitsuba_avatar.loaded_run import LoadedRun
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,7 @@ class AnalyzeCommand:
 
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit or ablate wrote
     capture: str = ""  # another capture of the same rig; default: the one it was trained on
+    drives: tuple[str, ...] = ()  # captures whose test frames drive the avatar, each with every imputation of the latent code
     out: str = ""  # where report and pictures go; default: RUN/analysis
     checkpoint: str = "last"  # best or last
     frames: int = 40  # of each split that geometry is measured on
@@ -65,6 +70,8 @@ def _analyze(command: AnalyzeCommand) -> int:
         effects = control_effects(study, liveliest_controls(study))
         progress.update("disentanglement", 0, 1)
         report = {"disentanglement": disentanglement(study), "geometry": geometry_errors(study, command.frames)}
+        if command.drives:
+            report["imputation"] = _imputations(command, loaded, study, progress)
         report["share_outside_region"] = {effect.name: effect.share_outside for effect in effects}
         with atomic_path(folder / "report.json") as temporary:
             temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -82,6 +89,21 @@ def _analyze(command: AnalyzeCommand) -> int:
     sys.stdout.write(json.dumps(report, indent=2) + "\n")
     sys.stderr.write(f"Report and pictures are in {folder}\n")
     return 0
+
+
+def _imputations(command: AnalyzeCommand, loaded: "LoadedRun", study: "Study", progress: StageProgress) -> dict:
+    """Folder of each driving capture -> its setting, and the figures of every imputation."""
+    from mitsuba_avatar.analysis.imputations import drive_of_capture, imputation_figures
+    from mitsuba_avatar.driving.training_latents import training_latents
+    from mitsuba_avatar.training.readiness import open_as_set
+
+    run, avatar, result = loaded.run, loaded.avatar, {}
+    training = training_latents(run, avatar, lambda: open_as_set(run.capture_path, run.settings.capture), command.checkpoint)
+    for done, path in enumerate(command.drives):
+        progress.update("imputations", done, len(command.drives))
+        drive = drive_of_capture(run, avatar, path, training)
+        result[path] = {"setting": drive.setting, "notes": list(drive.notes), **imputation_figures(study, training, drive.signals)}
+    return result
 
 
 if __name__ == "__main__":
