@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mitsuba_avatar.body.driving import face_keypoints
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skeleton import Skeleton
-from mitsuba_avatar.body.skinning import pose_vertices
+from mitsuba_avatar.body.skinning import blend_transforms
 from mitsuba_avatar.body.sparse import SparseLinear
 
 SKIN_REACH = 2.0  # of the distance from a joint to its nearest skin: the skin around the joint, not that of one side alone
@@ -39,8 +39,11 @@ class DrivenKeypoints(nn.Module):
         self.rig, self.with_face = rig, with_face
         self.skeleton = Skeleton(rig)
         self.regressor = joint_regressor(rig)
+        # Only the skin that some joint is read off needs to be posed: a fraction of the body.
+        skin = self.regressor.transposed_offset.diff() > 0
+        self.register_buffer("skin", torch.nonzero(skin)[:, 0], persistent=False)
         self.register_buffer("template_vertices", template_vertices.detach().clone(), persistent=False)
-        self.register_buffer("skinning_weights", torch.from_numpy(rig.skinning_weights), persistent=False)
+        self.register_buffer("skinning_weights", torch.from_numpy(rig.skinning_weights)[self.skin], persistent=False)
         self.register_buffer("joints", torch.from_numpy(rig.keypoint_joints), persistent=False)
         self.to(template_vertices.device)
 
@@ -69,9 +72,10 @@ class DrivenKeypoints(nn.Module):
         Gradients: to all arguments.
         """
         posed_from_rest = self.skeleton(theta, root)
-        both = torch.cat([rest_vertices, self.template_vertices.expand_as(rest_vertices)])
-        surface, template = pose_vertices(both, posed_from_rest.repeat(2, 1, 1, 1), self.skinning_weights).chunk(2)
-        offsets = self.regressor((surface - template).transpose(0, 1).flatten(1))  # [K, P * 3]
+        turns = blend_transforms(posed_from_rest, self.skinning_weights)[..., :3]  # [P, S, 3, 3]; the shift is the same on both surfaces
+        moved = (turns * (rest_vertices - self.template_vertices)[:, self.skin, None]).sum(-1)  # [P, S, 3]
+        everywhere = torch.zeros_like(rest_vertices).index_copy(1, self.skin, moved)
+        offsets = self.regressor(everywhere.transpose(0, 1).flatten(1))  # [K, P * 3]
         body = self.skeleton.posed_joints(posed_from_rest)[:, self.joints] + offsets.unflatten(1, (-1, 3)).transpose(0, 1)
         return torch.cat([body, face_keypoints(self.rig, rest_vertices).unflatten(1, (-1, 3))], dim=1) if self.with_face else body
 
