@@ -180,7 +180,7 @@ def test_a_fault_of_the_base_is_named_with_its_file(tmp_path):
 
 
 NO_DISENTANGLEMENT = {"loss.kl": 1e-4, "loss.mutual_information": 0.0, "loss.perturbation": 0.0}
-PLAIN_DECODER = {"model.use_localization": False, "model.use_compression": False, "model.use_shadow": False}
+PLAIN_DECODER = {"model.use_localization": False, "model.use_shadow": False}
 ABLATIONS = {
     "pose_face": PLAIN_DECODER | {"model.use_latent": False},
     "pose_face_latent": PLAIN_DECODER | NO_DISENTANGLEMENT,
