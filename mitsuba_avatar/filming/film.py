@@ -12,10 +12,12 @@ import hashlib
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 from numpy.lib.format import open_memmap
 
 from mitsuba_avatar.body.driving import face_keypoints
@@ -134,18 +136,38 @@ class _Filming:
         sensor, backdrop = Sensor.of(self.settings), np.float32(_backdrop(self.settings))
         size = self.settings.light.occlusion_size
         occlusion = OcclusionTruth(self.folder, person.rig.topology, size) if size else None
-        for done, (frame, cameras) in enumerate(missing.items()):
-            if cameras:
-                surfaces = self.performance.surfaces(frame)
-                if occlusion is not None:
-                    occlusion.write(frame, surfaces.registered)
-                radiance, coverage = stage.shoot(surfaces.layers, self.settings.seed * 1_000_003 + frame, cameras)
-                recorded = sensor.record(radiance + (1 - coverage[..., None]) * backdrop, frame, cameras)
-                for index, image, mask in zip(cameras, encode_bytes(recorded, "srgb"), coverage, strict=True):
-                    self.writer.write_mask(names[index], frame, mask)
-                    self.writer.write_image(names[index], frame, image)
-            self.progress("filming", done + 1, len(missing))
-            yield frame
+        # Encoding an image takes a core for a while, in which the next ones can be traced.
+        with ThreadPoolExecutor(max_workers=1) as encoder:
+            writing: Future[None] | None = None
+            for done, (frame, cameras) in enumerate(missing.items()):
+                if cameras:
+                    surfaces = self.performance.surfaces(frame)
+                    if occlusion is not None:
+                        occlusion.write(frame, surfaces.registered)
+                    shots = stage.images(surfaces.layers, self.settings.seed * 1_000_003 + frame, cameras)
+                    for index, (radiance, coverage) in zip(cameras, shots, strict=True):
+                        if writing is not None:
+                            writing.result()  # raises what went wrong there; and images that wait do not pile up
+                        writing = encoder.submit(self._keep, names[index], frame, sensor, radiance, coverage, backdrop)
+                self.progress("filming", done + 1, len(missing))
+                yield frame
+            if writing is not None:
+                writing.result()
+
+    def _keep(
+        self,
+        camera: str,
+        frame: int,
+        sensor: Sensor,
+        radiance: Float32[np.ndarray, "H W 3"],
+        coverage: Float32[np.ndarray, "H W"],
+        backdrop: np.float32,
+    ) -> None:
+        """Record one image by its camera's sensor and write it, the mask first."""
+        index = list(self.dome.cameras).index(camera)
+        recorded = sensor.record((radiance + (1 - coverage[..., None]) * backdrop)[None], frame, [index])[0]
+        self.writer.write_mask(camera, frame, coverage)
+        self.writer.write_image(camera, frame, encode_bytes(recorded, "srgb"))
 
     def _has(self, camera: str, frame: int) -> bool:
         return self.writer.has_image(camera, frame) and self.writer.has_mask(camera, frame)

@@ -53,6 +53,7 @@ class SplitPathIntegrator(mi.SamplingIntegrator):
     def _light_along(self, scene: mi.Scene, sampler: mi.Sampler, path: mi.Ray3f, throughput: mi.Spectrum):
         """Radiance that arrives along `path`, times `throughput`, and the sampler, advanced."""
         context = mi.BSDFContext()
+        lamps = _Lamps(scene)
 
         def scatter(hit, path, throughput, sampler):
             hit = _towards_viewer(hit, path)
@@ -61,10 +62,10 @@ class SplitPathIntegrator(mi.SamplingIntegrator):
 
         def bounce(path, throughput, light, depth, alive, sampler):
             hit = scene.ray_intersect(path, ray_flags=+mi.RayFlags.All, coherent=False, active=alive)
-            light = light + throughput * hit.emitter(scene, alive).eval(hit, alive)
+            light = light + throughput * lamps.seen_at(hit, alive)
             depth = depth + 1
             alive = alive & hit.is_valid() & (depth < self.max_depth)
-            # A branch, not a mask: on their last segment, most paths skip the BSDF.
+            # A branch, not a mask: where most paths end, they skip the BSDF.
             path, throughput, sampler = dr.if_stmt(
                 args=(hit, path, throughput, sampler),
                 cond=alive,
@@ -74,17 +75,45 @@ class SplitPathIntegrator(mi.SamplingIntegrator):
             )
             return path, throughput, light, depth, alive, sampler
 
-        _, _, light, _, _, sampler = dr.while_loop(
+        # Of the last segment only what it ends at matters: nothing to scatter there, and under an environment alone not even where.
+        bounces = self.max_depth - 1 if lamps.are_shapes else self.max_depth - 2
+        path, throughput, light, _, alive, sampler = dr.while_loop(
             state=(mi.Ray3f(path), throughput, mi.Spectrum(0), mi.UInt32(1), dr.any(throughput > 0), sampler),
-            cond=lambda path, throughput, light, depth, alive, sampler: alive,
+            cond=lambda path, throughput, light, depth, alive, sampler: alive & (depth <= bounces),
             body=bounce,
             label="bounces",
         )
+        if not lamps.are_shapes and self.max_depth > 1:
+            light = light + throughput * lamps.seen_along(path, alive)
         return light, sampler
 
     def to_string(self):
         """Description in Mitsuba's logs."""
         return f"SplitPathIntegrator[max_depth={self.max_depth}, splits={self.splits}]"
+
+
+class _Lamps:
+    """The lights of a scene, as paths that end at them see them."""
+
+    def __init__(self, scene: mi.Scene):
+        self.scene, self.environment = scene, scene.environment()
+        self.are_shapes = any(emitter.get_shape() is not None for emitter in scene.emitters())
+
+    def seen_at(self, hit: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+        """Radiance that leaves towards the viewer from where a ray ended: at a lamp, or nowhere, which is the environment."""
+        if self.are_shapes or self.environment is None:
+            return hit.emitter(self.scene, active).eval(hit, active)
+        escaped = active & ~hit.is_valid()
+        return dr.select(escaped, self.environment.eval(hit, escaped), 0)
+
+    def seen_along(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Spectrum:
+        """The environment's radiance along a ray that nothing blocks; where no lamp is a shape, that is all the light there is."""
+        if self.environment is None:
+            return mi.Spectrum(0)
+        escaped = active & ~self.scene.ray_test(ray, coherent=False, active=active)
+        nowhere = dr.zeros(mi.SurfaceInteraction3f)
+        nowhere.wi = -ray.d
+        return dr.select(escaped, self.environment.eval(nowhere, escaped), 0)
 
 
 def _towards_viewer(hit, ray):

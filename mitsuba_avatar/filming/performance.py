@@ -74,20 +74,20 @@ class Performance:
         Raises:
             ValueError: if the garment explodes; names frame, segment and the setting to change.
         """
-        person = self.person
+        person, transforms = self.person, self._transforms(self.motion, frame)
         moved = person.cloth.displacements(self._states[frame : frame + 1])[0]
         moved = moved + np.einsum("a,avc->vc", self.motion.actions[frame], person.action_displacements)
         filmed_rest = person.filmed.vertices + moved
         if person.outfit is None:
             rest = filmed_rest.astype(np.float32)
-            registered = self._posed(frame, rest)
+            registered = self._posed(transforms, rest)
             body, garment = registered, []
         else:
             cloth = self.garment(frame)
-            body = self._posed(frame, (filmed_rest + person.under.inset).astype(np.float32))
-            bare = self._posed(frame, (person.registered.vertices + moved).astype(np.float32))
+            body = self._posed(transforms, (filmed_rest + person.under.inset).astype(np.float32))
+            bare = self._posed(transforms, (person.registered.vertices + moved).astype(np.float32))
             registered = register_garment(bare[None], person.outfit.mesh, cloth[None])[0]
-            rest = self._unposed(frame, registered)
+            rest = self._unposed(transforms, registered)
             garment = [cloth]
         return Surfaces([body, *garment, *(part.surface(body) for part in person.parts)], registered, rest)
 
@@ -152,7 +152,7 @@ class Performance:
     def body_outline(self, frames: list[int]) -> Float32[np.ndarray, "n v 3"]:
         """Some vertices of the body in some frames, cheaply: where cameras must look."""
         rest = self.person.registered.vertices
-        return np.stack([self._posed(frame, rest)[::7] for frame in frames])
+        return np.stack([self._posed(self._transforms(self.motion, frame), rest)[::7] for frame in frames])
 
     def _on_floor(self, motion: Motion) -> Motion:
         """The motion, shifted so that the lowest point of every frame is as high above the floor as it should be, whatever ankles do."""
@@ -171,12 +171,13 @@ class Performance:
         return next(order for order, segment in enumerate(self._segments) if segment.start <= frame < segment.stop)
 
     def _transforms(self, motion: Motion, frame: int) -> torch.Tensor:
-        return self._skeleton(torch.from_numpy(motion.theta[frame : frame + 1]), torch.from_numpy(motion.root[frame : frame + 1]))
-
-    def _posed(self, frame: int, rest: Float32[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
         with torch.no_grad():
-            return pose_vertices(torch.from_numpy(rest)[None], self._transforms(self.motion, frame), self._weights)[0].numpy()
+            return self._skeleton(torch.from_numpy(motion.theta[frame : frame + 1]), torch.from_numpy(motion.root[frame : frame + 1]))
 
-    def _unposed(self, frame: int, posed: Float32[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
+    def _posed(self, transforms: torch.Tensor, rest: Float32[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
         with torch.no_grad():
-            return unpose_vertices(torch.from_numpy(posed)[None], self._transforms(self.motion, frame), self._weights)[0].numpy()
+            return pose_vertices(torch.from_numpy(rest)[None], transforms, self._weights)[0].numpy()
+
+    def _unposed(self, transforms: torch.Tensor, posed: Float32[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
+        with torch.no_grad():
+            return unpose_vertices(torch.from_numpy(posed)[None], transforms, self._weights)[0].numpy()

@@ -6,7 +6,7 @@ shading crosses seams. (Differentiable rendering must not do this; filming takes
 A scene is never rebuilt: rebuilding leaks memory (mitsuba3 issue 1890).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,17 +95,27 @@ class Stage:
         Raises:
             ValueError: if the vertices are not those of the layers.
         """
-        self._move(vertices)
         chosen = range(len(self.cameras)) if cameras is None else cameras
-        images, pending = [], None
-        for index in chosen:
+        radiance, coverage = zip(*self.images(vertices, seed, chosen), strict=True)
+        return np.stack(radiance), np.stack(coverage)
+
+    def images(
+        self, vertices: Sequence[Float32[np.ndarray, "_ 3"]], seed: int, cameras: Sequence[int]
+    ) -> Iterator[tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]]:
+        """Radiance and coverage camera by camera, as `shoot` returns them together: at the paper's size, all of a frame fill a memory.
+
+        One image is traced while the caller sees to the one before; the stage is busy until the last was taken.
+        """
+        self._move(vertices)
+        pending = None
+        for index in cameras:
             following = self._exposure.begin(self.cameras[index], self._pixels(index, vertices), (seed, index))
             # One image is traced while Python prepares the next; more at once would only need memory.
-            images += [pending.finish()] if pending else []
+            if pending is not None:
+                yield _parted(pending.finish())
             pending = following
-        images += [pending.finish()] if pending else []
-        stacked = np.stack(images)
-        return np.ascontiguousarray(stacked[..., :3]), np.ascontiguousarray(stacked[..., 3])
+        if pending is not None:
+            yield _parted(pending.finish())
 
     def _move(self, vertices: Sequence[np.ndarray]) -> None:
         """Carry every mesh to its place in a frame."""
@@ -159,6 +169,11 @@ class _StagedMesh:
         parameters["vertex_texcoords"] = split.image_uv.ravel()
         parameters.update()
         self.shape = mesh
+
+
+def _parted(image: Float32[np.ndarray, "H W 4"]) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
+    """Radiance and coverage."""
+    return np.ascontiguousarray(image[..., :3]), np.ascontiguousarray(image[..., 3])
 
 
 def _check(layers: Sequence[Layer], cameras: Sequence[Camera]) -> None:

@@ -9,7 +9,11 @@ WIDTH, HEIGHT = 24, 16
 
 @pytest.fixture(scope="module")
 def scene() -> mi.Scene:
-    """A glossy sphere that nearly touches a coloured floor, under a dome that is a little brighter on one side."""
+    return _ball_under_dome()
+
+
+def _ball_under_dome(**more: object) -> mi.Scene:
+    """A glossy sphere that nearly touches a coloured floor, under a dome that is a little brighter on one side; and more things."""
     dome = np.full((8, 16, 3), 0.75, dtype=np.float32)
     dome[:, :8] = [1.0, 0.9, 0.8]
     return mi.load_dict(
@@ -37,6 +41,7 @@ def scene() -> mi.Scene:
                 "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgba", "rfilter": {"type": "box"}},
                 "sampler": {"type": "multijitter"},
             },
+            **more,
         }
     )
 
@@ -53,6 +58,23 @@ def test_it_agrees_with_mitsubas_path_tracer(scene: mi.Scene):
         difference = np.abs(ours - reference)
         assert difference[..., :3].mean() < 0.004 and difference[..., :3].max() < 0.05, f"depth {depth}: {difference.mean()}"
         np.testing.assert_allclose(ours[..., 3], reference[..., 3], atol=0.05)
+
+
+def test_a_lamp_with_a_shape_is_seen_by_paths_that_end_at_it(scene: mi.Scene):
+    """A black lamp that no path meets changes no bit, although the last segment's end is then looked for; a bright one above lights."""
+    black, bright = (
+        _ball_under_dome(
+            lamp={
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, height, 0]).rotate([1, 0, 0], 90),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+            }
+        )
+        for height, radiance in ((-50, 0.0), (1.5, 6.0))
+    )
+    without = _render(scene, "split_path", 16, max_depth=3, splits=2)
+    np.testing.assert_array_equal(_render(black, "split_path", 16, max_depth=3, splits=2), without)
+    assert _render(bright, "split_path", 16, max_depth=3, splits=2)[..., :3].mean() > 1.1 * without[..., :3].mean()
 
 
 def test_indirect_light_is_there(scene: mi.Scene):
