@@ -9,6 +9,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 from jaxtyping import Float32
@@ -17,6 +18,7 @@ from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.filming.hidden_state import Error, HiddenState, angles_that_move, measure_hidden_state
 from mitsuba_avatar.filming.motion import body_angles, pose_distances
 from mitsuba_avatar.filming.performance import Performance, Progress
+from mitsuba_avatar.filming.takes import is_stress
 
 INFO = "info.json"
 LOG = "filming_log.csv"
@@ -74,7 +76,7 @@ def hidden_state(performance: Performance, rest_vertices: Float32[np.ndarray, "N
     None if there is nothing to score on. Frames of stress segments are left out.
     """
     frames, person = performance.motion.frames, performance.person
-    scored = [index for index, frame in enumerate(frames) if frame.split in ("train", "test") and not frame.segment.startswith("stress")]
+    scored = [index for index, frame in enumerate(frames) if frame.split == "train" or _is_scored(performance, index)]
     kept = np.array(scored[:: -(-len(scored) // MOST_FRAMES)])
     is_train = np.array([frames[index].split == "train" for index in kept])
     if is_train.sum() < 2 or is_train.all():
@@ -96,39 +98,39 @@ def measure_gates(performance: Performance, progress: Callable[[str, int, int], 
     Raises:
         ValueError: if there are no test frames to score on, or a garment explodes.
     """
-    performance.simulate_missing(list(range(len(performance))), lambda done, total: progress("simulating cloth", done, total))
+    performance.simulate_missing(range(len(performance)), lambda done, total: progress("simulating cloth", done, total))
     floor = None
     if performance.person.outfit is not None:
         floor = chaos_floor(performance, lambda done, total: progress("simulating from another start", done, total))
-    rest = []
-    for frame in range(len(performance)):
-        rest.append(performance.surfaces(frame).rest)
-        progress("collecting surfaces", frame + 1, len(performance))
-    hidden = hidden_state(performance, np.stack(rest), floor)
+    shape = (len(performance), performance.person.rig.topology.num_vertices, 3)
+    with TemporaryFile() as scratch:  # as large as the capture's surfaces, which memory need not hold
+        rest = np.memmap(scratch, np.float32, "w+", shape=shape)
+        for frame in range(len(performance)):
+            rest[frame] = performance.surfaces(frame).rest
+            progress("collecting surfaces", frame + 1, len(performance))
+        hidden = hidden_state(performance, rest, floor)
     if hidden is None:
         raise ValueError("measure_gates(): expected training and test frames; got a script without one of them. Set motion.test_frames.")
     return hidden, distances_of_segments(performance)
 
 
-def chaos_floor(performance: Performance, progress: Progress | None = None) -> Error:
+def chaos_floor(performance: Performance, progress: Progress) -> Error:
     """How far garments drift apart that start a millimetre apart: what no signal, not even the whole past, can predict.
 
     Simulates every test segment once more. Both garments are compared in the world; their bodies are equal.
     """
     clothing = replace(performance.settings.clothing, start_noise=START_NOISE)
-    segments = performance.motion.segments()
-    orders = [order for order, segment in enumerate(segments) if _is_scored(performance, segment.start)]
-    total, before, differences = performance.frames_of(orders), 0, []
-    coarse = len(performance.person.outfit.mesh.body_vertices)
-    for order in orders:
-        forward = None if progress is None else lambda done, _, before=before: progress(before + done, total)
-        other = performance.simulated(order, clothing, forward)
-        exact = np.load(performance.garment_path(order), mmap_mode="r")
-        differences.append(other[:, :coarse] - exact[:, :coarse])
-        before += performance.frames_of([order])
-    return Error.of(np.concatenate(differences))
+    scored = [(order, frames) for order, frames in enumerate(performance.motion.segments()) if _is_scored(performance, frames.start)]
+    total = sum(frames.stop - frames.start for _, frames in scored)
+    coarse, differences = len(performance.person.outfit.mesh.body_vertices), []
+    for order, frames in scored:
+        for index, other in enumerate(performance.resimulated(order, clothing)):
+            differences.append(other[:coarse] - performance.garment(frames.start + index)[:coarse])
+            progress(len(differences), total)
+    return Error.of(np.stack(differences))
 
 
 def _is_scored(performance: Performance, frame: int) -> bool:
+    """Whether a frame is a test frame that is not reported apart."""
     moment = performance.motion.frames[frame]
-    return moment.split == "test" and not moment.segment.startswith("stress")
+    return moment.split == "test" and not is_stress(moment)

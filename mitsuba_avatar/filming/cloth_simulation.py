@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int32
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -31,7 +31,6 @@ SETTLE_SHARE = 0.7  # of the settling time until the first pose is reached; then
 FARTHEST = 0.3  # metres from the body: cloth beyond is not carried by it, and a sign of an explosion
 LARGEST_STRETCH, STRETCH_SLACK = 3.0, 0.03  # factor and metres on top by which a thread may be longer than at rest
 DEEPEST, SHARE_DEEP = 0.04, 0.02  # metres inside the body at which cloth counts as lost, and the share of vertices that may be
-Progress = Callable[[int, int], None]  # frames done, frames in all
 
 
 @dataclass(frozen=True, eq=False)  # arrays have no truth value to compare by
@@ -50,11 +49,6 @@ class BodyMotion:
     root: Float32[np.ndarray, "N 4 4"]
     fps: float
     rest_vertices: Float32[np.ndarray, "*frames V 3"]
-
-    def part(self, frames: slice) -> "BodyMotion":
-        """Some of the frames."""
-        rest = self.rest_vertices[frames] if self.rest_vertices.ndim == 3 else self.rest_vertices
-        return BodyMotion(self.theta[frames], self.root[frames], self.fps, rest)
 
     def rest_at(self, frame: int) -> Float32[np.ndarray, "V 3"]:
         """The rest surface of a frame."""
@@ -80,39 +74,28 @@ class BodyMotion:
         return lambda at: spline(at)[:, :-3], root_at
 
 
-def simulate_garment(
-    rig: Rig,
-    outfit: Outfit,
-    motion: BodyMotion,
-    segments: list[tuple[str, slice]],
-    settings: ClothingSettings,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> Float32[np.ndarray, "N G 3"]:
-    """The garment in every frame. For some segments only, give those; the other frames stay NaN.
+@dataclass(frozen=True, eq=False)  # arrays have no truth value to compare by
+class ClothState:
+    """A simulated garment at a frame of its segment, and all that a simulation needs to go on from there to the same bits.
 
-    Args:
-        rig: of the body.
-        outfit: what is worn.
-        motion: of the body.
-        segments: name and frames of each run of consecutive frames, which starts without history.
-        settings: substeps, settling time, self-collision, start noise.
-        seed: of the start noise; without such noise it has no effect.
-        progress: called after every frame.
-
-    Raises:
-        ValueError: if the cloth explodes; the message names frame, segment and the setting to change.
+    Attributes:
+        frame: of the segment, counted from 0.
+        vertices: [G, 3] the garment; velocities: [G, 3] metres per second.
+        steps: how many were taken, settling included.
+        contact_faces, contact_places, contact_distances: of each vertex, the body's triangle closest to it at the last search.
+        body_points: [O, 3] the surface that stops cloth, as posed.
+        searched_at: [G, 3] where vertices were at that search; empty where folds do not keep apart.
     """
-    simulator = ClothSimulator(rig, outfit, settings)
-    vertices = np.full((len(motion.theta), len(outfit.mesh.rest_vertices), 3), np.nan, dtype=np.float32)
-    total, done = sum(segment.stop - segment.start for _, segment in segments), 0
-    for name, segment in segments:
-        for index, frame in enumerate(simulator.frames(motion.part(segment), name, seed)):
-            vertices[segment.start + index] = frame
-            done += 1
-            if progress is not None:
-                progress(done, total)
-    return vertices
+
+    frame: int
+    vertices: Float32[np.ndarray, "G 3"]
+    velocities: Float32[np.ndarray, "G 3"]
+    steps: int
+    contact_faces: Int32[np.ndarray, "G"]  # noqa: F821
+    contact_places: Float32[np.ndarray, "G 2"]
+    contact_distances: Float32[np.ndarray, "G"]  # noqa: F821
+    body_points: Float32[np.ndarray, "O 3"]
+    searched_at: Float32[np.ndarray, "_ 3"]
 
 
 class ClothSimulator:
@@ -135,28 +118,37 @@ class ClothSimulator:
         self.tethers, self.tether_lengths = _integers(self.mesh.tethers), _floats(self.mesh.tether_lengths)
         self.inverse_mass, self.rest = _floats(1.0 - self.mesh.pinned), _vectors(self.mesh.rest_vertices)
 
-    def frames(self, motion: BodyMotion, segment: str, seed: int = 0) -> Iterator[Float32[np.ndarray, "G 3"]]:
-        """Simulate one segment from the start; yields the garment's [G, 3] vertices frame by frame.
+    def states(self, motion: BodyMotion, segment: str, seed: int = 0, after: ClothState | None = None) -> Iterator[ClothState]:
+        """Simulate one segment frame by frame.
+
+        Args:
+            motion: of the body in the whole segment.
+            segment: its name, for messages.
+            seed: of the start noise; without such noise it has no effect.
+            after: a state of this simulation, to go on from; None starts with the garment put on. Both give the same bits.
 
         Raises:
-            ValueError: if the cloth explodes.
+            ValueError: if the cloth explodes; the message names frame, segment and the setting to change.
         """
         per_frame = max(1, int(np.ceil(self.settings.substeps_per_second / motion.fps - 1e-9)))
         time_step = 1 / motion.fps / per_frame
         run = _Run(self, motion, time_step, seed)
-        settle = max(1, round(self.settings.settle_time / time_step))
-        ramp = np.clip(np.arange(1, settle + 1) / (SETTLE_SHARE * settle), 0, 1)
-        ramp = ramp * ramp * (3 - 2 * ramp)
-        run.go(ramp[:, None] * motion.theta[:1], np.repeat(motion.root[:1], settle, axis=0))
+        if after is None:
+            settle = max(1, round(self.settings.settle_time / time_step))
+            ramp = np.clip(np.arange(1, settle + 1) / (SETTLE_SHARE * settle), 0, 1)
+            ramp = ramp * ramp * (3 - 2 * ramp)
+            run.go(ramp[:, None] * motion.theta[:1], np.repeat(motion.root[:1], settle, axis=0))
+        else:
+            run.restore(after, motion)
         theta_at, root_at = motion.curves()
-        for frame in range(len(motion.theta)):
+        for frame in range(0 if after is None else after.frame + 1, len(motion.theta)):
             if frame > 0:
                 run.aim_at(motion.rest_at(frame)[self.body_vertices])
                 times = frame - 1 + np.arange(1, per_frame + 1) / per_frame
                 run.go(theta_at(times), root_at(times))
-            vertices = run.positions.numpy().copy()
-            self._check(vertices, run, f"frame {frame} of segment {segment!r}")
-            yield vertices
+            state = run.state(frame)
+            self._check(state.vertices, run, f"frame {frame} of segment {segment!r}")
+            yield state
 
     def _check(self, vertices: Float32[np.ndarray, "G 3"], run: "_Run", where: str) -> None:
         """Refuse cloth that has exploded."""
@@ -165,23 +157,23 @@ class ClothSimulator:
             "or keep the limbs farther from the trunk."
         )
         if not np.isfinite(vertices).all():
-            raise ValueError(f"simulate_garment(): expected finite cloth; got NaN or infinity at {where}. {remedy}")
+            raise ValueError(f"states(): expected finite cloth; got NaN or infinity at {where}. {remedy}")
         ends = vertices[self.mesh.edges]
         excess = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) - LARGEST_STRETCH * self.mesh.edge_lengths - STRETCH_SLACK
         if excess.max() > 0:
             raise ValueError(
-                f"simulate_garment(): expected cloth that holds together; got a thread {excess.max():.3f} m beyond "
+                f"states(): expected cloth that holds together; got a thread {excess.max():.3f} m beyond "
                 f"{LARGEST_STRETCH:g} times its length at {where}. {remedy}"
             )
         depth, is_near = run.depth()
         if np.mean(~is_near) > SHARE_DEEP:
             raise ValueError(
-                f"simulate_garment(): expected cloth within {FARTHEST} m of the body; {100 * np.mean(~is_near):.0f} % are farther "
+                f"states(): expected cloth within {FARTHEST} m of the body; {100 * np.mean(~is_near):.0f} % are farther "
                 f"at {where}. {remedy}"
             )
         if np.mean(depth > DEEPEST) > SHARE_DEEP:
             raise ValueError(
-                f"simulate_garment(): expected cloth outside the body; {100 * np.mean(depth > DEEPEST):.0f} % lie more than {DEEPEST} m "
+                f"states(): expected cloth outside the body; {100 * np.mean(depth > DEEPEST):.0f} % lie more than {DEEPEST} m "
                 f"inside at {where}. {remedy}"
             )
 
@@ -216,6 +208,7 @@ class _Run:
         self._pose(0, 0.0)
         self.tree = wp.Mesh(points=self.body.points, indices=simulator.corners)
         self.grid = wp.HashGrid(64, 64, 64, device=DEVICE) if simulator.settings.self_distance > 0 else None
+        self.searched_at = _vectors(np.zeros((0, 3)))
 
     def aim_at(self, rest_vertices: Float32[np.ndarray, "O 3"]) -> None:
         """Set the rest surface that the next steps lead to."""
@@ -228,6 +221,26 @@ class _Run:
             wp.copy(self.body.points_before, self.body.points)
             self._pose(row, (row + 1) / len(theta))
             self._advance()
+
+    def state(self, frame: int) -> ClothState:
+        """Copies of what the next steps depend on."""
+        contacts = (self.contacts.face, self.contacts.place, self.contacts.distance)
+        copies = [array.numpy().copy() for array in (self.positions, self.cloth.velocities, *contacts, self.body.points, self.searched_at)]
+        return ClothState(frame, copies[0], copies[1], self.steps, *copies[2:])
+
+    def restore(self, state: ClothState, motion: BodyMotion) -> None:
+        """Be where a run was when `state` was taken of it."""
+        self.steps = state.steps
+        self.positions.assign(state.vertices)
+        self.cloth.velocities.assign(state.velocities)
+        self.contacts.face.assign(state.contact_faces)
+        self.contacts.place.assign(state.contact_places)
+        self.contacts.distance.assign(state.contact_distances)
+        self.body.points.assign(state.body_points)
+        self.rest_before = self.rest_after = _vectors(motion.rest_at(state.frame)[self.simulator.body_vertices])
+        if self.grid is not None:
+            self.searched_at = _vectors(state.searched_at)
+            self.grid.build(self.searched_at, self.simulator.settings.self_distance)
 
     def depth(self) -> tuple[Float32[np.ndarray, "G"], Bool[np.ndarray, "G"]]:
         """Metres that each vertex lies inside the plane of its closest triangle, and whether it has one."""
@@ -252,7 +265,8 @@ class _Run:
             self.tree.refit()
             _launch(kernels.find_contacts, len(x), [self.tree.id, x, FARTHEST, self.contacts])
             if self.grid is not None:
-                self.grid.build(x, settings.self_distance)
+                self.searched_at = wp.clone(x)
+                self.grid.build(self.searched_at, settings.self_distance)
         free = [x, simulator.inverse_mass]
         bend_give, stretch_give = ((time / self.time_step) ** 2 for time in (simulator.fabric.bend_time, simulator.fabric.stretch_time))
         _launch(kernels.advance, 1, [self.step, self.cloth, simulator.pin_vertices, self.pin_targets, self.body, self.contacts])

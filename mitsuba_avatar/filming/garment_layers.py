@@ -14,11 +14,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from mitsuba_avatar.body.mesh import unique_edges, vertex_normals
-from mitsuba_avatar.body.rig import Rig
-from mitsuba_avatar.body.skeleton import Skeleton
-from mitsuba_avatar.body.skinning import unpose_vertices
 from mitsuba_avatar.filming.anatomy import ARM, LEG, Anatomy, smooth_step
-from mitsuba_avatar.filming.cloth_simulation import BodyMotion
 from mitsuba_avatar.filming.garment_mesh import GarmentMesh, boundary_edges
 from mitsuba_avatar.filming.wardrobe import Outfit
 
@@ -83,13 +79,3 @@ def register_garment(
     registered = body.copy()
     registered[:, mesh.body_vertices] = garment[:, : len(mesh.body_vertices)]
     return registered
-
-
-def unpose_garment(rig: Rig, mesh: GarmentMesh, garment: Float32[np.ndarray, "N G 3"], motion: BodyMotion) -> Float32[np.ndarray, "N C 3"]:
-    """The garment's coarse vertices in rest space, as an encoder sees them: the movement of the skeleton is taken out."""
-    skeleton, weights = Skeleton(rig), torch.from_numpy(mesh.skinning_weights[: len(mesh.body_vertices)])
-    coarse = torch.from_numpy(np.ascontiguousarray(garment[:, : len(mesh.body_vertices)]))
-    with torch.no_grad():
-        transforms = skeleton(torch.from_numpy(motion.theta), torch.from_numpy(motion.root))
-        frames = [unpose_vertices(posed[None], transform[None], weights) for posed, transform in zip(coarse, transforms, strict=True)]
-    return torch.cat(frames).numpy()

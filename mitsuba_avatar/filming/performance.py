@@ -1,12 +1,12 @@
 """What happens in front of the cameras, frame by frame: made when it is asked for, so that memory does not grow with the frames.
 
-Simulated garments are the exception: they depend on all that went before in their segment. Each segment is simulated once, by whichever
-process needs it first, and kept as a file (`truth/garment_vertices/` of the capture), which others and later runs find there.
+Simulated garments are the exception: they depend on all that went before in their segment. Each segment is simulated as far as a frame
+needs it, and kept on disk (`truth/garment_vertices/` of the capture), where other processes and later runs find it and go on.
 
 Symbols: N frames, V body vertices, G garment vertices. Metres, world axes unless a name says rest.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,10 +16,10 @@ from jaxtyping import Float32
 
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.body.skinning import pose_vertices, unpose_vertices
-from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.filming.anatomy import FOOT, LEG
-from mitsuba_avatar.filming.cloth_simulation import BodyMotion, ClothSimulator
+from mitsuba_avatar.filming.cloth_simulation import BodyMotion, ClothSimulator, ClothState
 from mitsuba_avatar.filming.garment_layers import register_garment
+from mitsuba_avatar.filming.garment_record import GarmentRecord
 from mitsuba_avatar.filming.motion import Motion, perform
 from mitsuba_avatar.filming.person import Person, dress_person
 from mitsuba_avatar.filming.settings import ClothingSettings, StudioSettings
@@ -62,7 +62,7 @@ class Performance:
         self._states = self.person.cloth.states(motion.theta, settings.motion.fps, motion.segments())
         self.motion: Motion = self._on_floor(motion)
         self._segments = self.motion.segments()
-        self._garments: dict[int, Float32[np.ndarray, "n G 3"]] = {}
+        self._records: dict[int, GarmentRecord] = {}
 
     def __len__(self) -> int:
         """Frames."""
@@ -94,60 +94,54 @@ class Performance:
     def garment(self, frame: int) -> Float32[np.ndarray, "G 3"]:
         """The simulated garment in a frame."""
         order = self._segment_of(frame)
-        if order not in self._garments:
-            if not self.garment_path(order).is_file():
-                self.simulate(order)
-            self._garments = {order: np.load(self.garment_path(order), mmap_mode="r")}  # one open file at a time
-        return np.array(self._garments[order][frame - self._segments[order].start])
+        if order not in self._records:
+            self._records = {order: self.garment_record(order)}  # one open file at a time
+        index = frame - self._segments[order].start
+        self._records[order].extend(index, lambda after: self._states_of(order, self.settings.clothing, after), lambda _: None)
+        return self._records[order].frame(index)
 
-    def unsimulated(self, frames: list[int]) -> list[int]:
-        """Segments, by order, that hold some of these frames and are not simulated yet."""
+    def simulate_missing(self, frames: Sequence[int], progress: Progress) -> None:
+        """Simulate each segment as far as these frames need it; `progress` counts the frames of all of them that were missing.
+
+        A garment depends on all that went before in its segment: frames between those asked for are simulated too.
+
+        Raises:
+            ValueError: as `surfaces`; what was simulated before the explosion is kept.
+        """
         if self.person.outfit is None:
-            return []
-        return [order for order in sorted({self._segment_of(frame) for frame in frames}) if not self.garment_path(order).is_file()]
+            return
+        needed: dict[int, int] = {}  # segment, by order -> last frame in it
+        for frame in frames:
+            order = self._segment_of(frame)
+            needed[order] = max(needed.get(order, 0), frame - self._segments[order].start)
+        records = {order: self.garment_record(order) for order in sorted(needed)}
+        missing = {order: max(0, needed[order] + 1 - record.simulated) for order, record in records.items()}
+        before, total = 0, sum(missing.values())
+        for order, record in records.items():
+            record.extend(
+                needed[order],
+                lambda after, order=order: self._states_of(order, self.settings.clothing, after),
+                lambda done, before=before: progress(before + done, total),
+            )
+            before += missing[order]
 
-    def frames_of(self, orders: list[int]) -> int:
-        """How many frames some segments hold together."""
-        return sum(self._segments[order].stop - self._segments[order].start for order in orders)
+    def resimulated(self, order: int, clothing: ClothingSettings) -> Iterator[Float32[np.ndarray, "G 3"]]:
+        """The garment of a segment, frame by frame, under other settings of the simulation; nothing is kept."""
+        return (state.vertices for state in self._states_of(order, clothing, None))
 
-    def simulate_missing(self, frames: list[int], progress: Progress) -> None:
-        """Simulate every segment that holds some of these frames and is not simulated yet; `progress` counts frames of all of them.
+    def garment_record(self, order: int) -> GarmentRecord:
+        """A segment's garment on disk."""
+        segment = self._segments[order]
+        name = f"{order:03d}_{self.motion.frames[segment.start].segment}.npy"
+        return GarmentRecord(self.folder / "garment_vertices" / name, segment.stop - segment.start)
 
-        Raises:
-            ValueError: as `surfaces`; segments before the one that explodes are kept.
-        """
-        orders = self.unsimulated(frames)
-        total, before = self.frames_of(orders), 0
-        for order in orders:
-            self.simulate(order, lambda done, _, before=before: progress(before + done, total))
-            before += self.frames_of([order])
-
-    def simulate(self, order: int, progress: Progress | None = None) -> None:
-        """Simulate the garment of a segment and keep it, whole or not at all.
-
-        Raises:
-            ValueError: as `surfaces`; nothing is kept.
-        """
-        vertices = self.simulated(order, self.settings.clothing, progress)
-        with atomic_path(self.garment_path(order)) as temporary:
-            np.save(temporary, vertices)
-
-    def simulated(self, order: int, clothing: ClothingSettings, progress: Progress | None = None) -> Float32[np.ndarray, "n G 3"]:
-        """The garment of a segment under other settings of the simulation; nothing is kept."""
+    def _states_of(self, order: int, clothing: ClothingSettings, after: ClothState | None) -> Iterator[ClothState]:
+        """Simulate a segment."""
         person, segment = self.person, self._segments[order]
         obstacle = person.outfit.obstacle + person.cloth.displacements(self._states[segment])
         motion = BodyMotion(self.motion.theta[segment], self.motion.root[segment], self.settings.motion.fps, obstacle.astype(np.float32))
-        name, total = self.motion.frames[segment.start].segment, segment.stop - segment.start
-        frames = []
-        for vertices in ClothSimulator(person.rig, person.outfit, clothing).frames(motion, name, self.settings.seed + order):
-            frames.append(vertices)
-            if progress is not None:
-                progress(len(frames), total)
-        return np.stack(frames)
-
-    def garment_path(self, order: int) -> Path:
-        """File of a segment's garment."""
-        return self.folder / "garment_vertices" / f"{order:03d}_{self.motion.frames[self._segments[order].start].segment}.npy"
+        name = self.motion.frames[segment.start].segment
+        return ClothSimulator(person.rig, person.outfit, clothing).states(motion, name, self.settings.seed + order, after)
 
     def body_outline(self, frames: list[int]) -> Float32[np.ndarray, "n v 3"]:
         """Some vertices of the body in some frames, cheaply: where cameras must look."""

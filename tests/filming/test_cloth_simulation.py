@@ -6,7 +6,7 @@ import torch
 
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skeleton import Skeleton
-from mitsuba_avatar.filming.cloth_simulation import BodyMotion, ClothSimulator, _Skeleton, simulate_garment
+from mitsuba_avatar.filming.cloth_simulation import BodyMotion, ClothSimulator, _Skeleton
 from mitsuba_avatar.filming.settings import ClothingSettings
 from tests.filming.sphere_outfit import CENTRE, COTTON, RADIUS, ball_rig, square_outfit
 
@@ -25,7 +25,7 @@ def _motion(rig: Rig, turn: np.ndarray, fps: float = 10.0) -> BodyMotion:
 
 
 def _simulate(rig: Rig, outfit, motion: BodyMotion, settings: ClothingSettings = QUICK, seed: int = 0) -> np.ndarray:
-    return simulate_garment(rig, outfit, motion, [("take", slice(0, len(motion.theta)))], settings, seed)
+    return np.stack([state.vertices for state in ClothSimulator(rig, outfit, settings).states(motion, "take", seed)])
 
 
 def _lengths(outfit, vertices: np.ndarray) -> np.ndarray:
@@ -85,13 +85,29 @@ def test_friction_carries_cloth_along_with_turning_skin(ball: Rig, friction: flo
     assert smallest < turned < largest, f"{turned=}"
 
 
-def test_the_same_inputs_give_the_same_bits_and_segments_are_independent(ball: Rig):
+def test_a_simulator_leaves_no_traces_of_one_segment_in_the_next(ball: Rig):
     outfit = square_outfit(ball, size=0.3, height=RADIUS + 0.01)
-    motion = _motion(ball, np.concatenate([np.linspace(0, 1, 4), np.linspace(1, -1, 3)]))
-    both = simulate_garment(ball, outfit, motion, [("first", slice(0, 4)), ("second", slice(4, 7))], QUICK)
-    alone = simulate_garment(ball, outfit, motion, [("second", slice(4, 7))], QUICK)
-    assert np.isnan(alone[:4]).all()
-    np.testing.assert_array_equal(alone[4:], both[4:])
+    simulator = ClothSimulator(ball, outfit, QUICK)
+    first, again = (
+        np.stack([state.vertices for state in simulator.states(_motion(ball, np.linspace(1, -1, 3)), "take")]) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first, again)
+
+
+@pytest.mark.parametrize(("fps", "self_distance"), [(10.0, 0.0), (30.0, 0.008)])
+def test_a_simulation_that_goes_on_from_a_state_gives_the_same_bits(ball: Rig, fps: float, self_distance: float):
+    """Also where a frame ends between two searches for the closest triangles: at 30 frames a second there are 7 steps, 4 a search."""
+    outfit = square_outfit(ball, size=0.3, height=RADIUS + 0.01)
+    grown = ball.rest_vertices + np.linspace(0, 0.02, 6, dtype=np.float32)[:, None, None]
+    motion = dataclasses.replace(_motion(ball, np.linspace(0, 1.2, 6), fps), rest_vertices=grown)
+    settings = dataclasses.replace(QUICK, settle_time=0.2, self_distance=self_distance)
+    through = list(ClothSimulator(ball, outfit, settings).states(motion, "take"))
+    resumed = list(ClothSimulator(ball, outfit, settings).states(motion, "take", after=through[2]))
+    assert [state.frame for state in resumed] == [3, 4, 5]
+    assert np.abs(through[2].vertices - through[3].vertices).max() > 1e-4
+    for one, other in zip(through[3:], resumed, strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+        np.testing.assert_array_equal(one.velocities, other.velocities)
 
 
 def test_start_noise_changes_the_result_by_seed(ball: Rig):
@@ -121,7 +137,7 @@ def test_self_collision_keeps_a_folded_cloth_apart(ball: Rig):
     def closest(self_distance: float) -> float:
         simulator = ClothSimulator(ball, outfit, ClothingSettings(settle_time=0.1, self_distance=self_distance))
         simulator.mesh = dataclasses.replace(outfit.mesh, rest_vertices=folded)
-        vertices = next(simulator.frames(_motion(ball, np.zeros(1)), "take"))
+        vertices = next(simulator.states(_motion(ball, np.zeros(1)), "take")).vertices
         apart = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1)
         return float(apart[np.linalg.norm(flat[:, None] - flat[None], axis=-1) > 0.1].min())
 
