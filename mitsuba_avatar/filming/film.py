@@ -73,7 +73,7 @@ def film_capture(
 
     Raises:
         FileExistsError: if the folder holds something else.
-        ValueError: if a garment explodes; no image of its segment is made.
+        ValueError: if a garment explodes, in the frames that the shard needs; none of the shard's images is made.
         OSError: no write permission, disk full.
     """
     folder = Path(folder)

@@ -16,6 +16,7 @@ from jaxtyping import Float32
 
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.body.skinning import pose_vertices, unpose_vertices
+from mitsuba_avatar.captures.frames import Frame
 from mitsuba_avatar.filming.anatomy import FOOT, LEG
 from mitsuba_avatar.filming.cloth_simulation import BodyMotion, ClothSimulator, ClothState
 from mitsuba_avatar.filming.garment_layers import register_garment
@@ -23,8 +24,10 @@ from mitsuba_avatar.filming.garment_record import GarmentRecord
 from mitsuba_avatar.filming.motion import Motion, perform
 from mitsuba_avatar.filming.person import Person, dress_person
 from mitsuba_avatar.filming.settings import ClothingSettings, StudioSettings
+from mitsuba_avatar.filming.takes import is_stress
 
 Progress = Callable[[int, int], None]  # frames done, frames in all
+STRESS_SUBSTEPS = 800  # a second, at least, of wild motion: at 200 some shirts tear within two seconds
 ON_THE_FLOOR = (*FOOT, *LEG)  # parts of the body that may be the lowest
 
 
@@ -141,7 +144,8 @@ class Performance:
         obstacle = person.outfit.obstacle + person.cloth.displacements(self._states[segment])
         motion = BodyMotion(self.motion.theta[segment], self.motion.root[segment], self.settings.motion.fps, obstacle.astype(np.float32))
         name = self.motion.frames[segment.start].segment
-        return ClothSimulator(person.rig, person.outfit, clothing).states(motion, name, self.settings.seed + order, after)
+        steady = steady_enough(clothing, self.motion.frames[segment.start])
+        return ClothSimulator(person.rig, person.outfit, steady).states(motion, name, self.settings.seed + order, after)
 
     def body_outline(self, frames: list[int]) -> Float32[np.ndarray, "n v 3"]:
         """Some vertices of the body in some frames, cheaply: where cameras must look."""
@@ -175,3 +179,10 @@ class Performance:
     def _unposed(self, transforms: torch.Tensor, posed: Float32[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
         with torch.no_grad():
             return unpose_vertices(torch.from_numpy(posed)[None], transforms, self._weights)[0].numpy()
+
+
+def steady_enough(clothing: ClothingSettings, frame: Frame) -> ClothingSettings:
+    """How the segment of a frame is simulated: as asked for, but wild motion in smaller steps, which are part of what a capture is."""
+    if not is_stress(frame):
+        return clothing
+    return replace(clothing, substeps_per_second=max(STRESS_SUBSTEPS, clothing.substeps_per_second))

@@ -1,6 +1,7 @@
 import pytest
 
-from mitsuba_avatar.filming.settings import MotionSettings
+from mitsuba_avatar.filming.performance import steady_enough
+from mitsuba_avatar.filming.settings import ClothingSettings, MotionSettings
 from mitsuba_avatar.filming.takes import STUDY, frames_of, plan_recordings, plan_takes
 
 
@@ -55,3 +56,10 @@ def test_script_and_files_go_together():
         MotionSettings(script="mocap")
     with pytest.raises(ValueError, match="script study and 1 files"):
         MotionSettings(script="study", bvh=("a.bvh",))
+
+
+def test_only_wild_motion_is_simulated_in_smaller_steps():
+    frames = frames_of(plan_takes(STUDY, MotionSettings(script="study", train_frames=12, test_frames=4, stress_frames=3)), 10.0)
+    steps = [steady_enough(ClothingSettings(substeps_per_second=240), frame).substeps_per_second for frame in frames]
+    assert steps == [240] * (len(frames) - 3) + [800] * 3
+    assert steady_enough(ClothingSettings(substeps_per_second=900), frames[-1]).substeps_per_second == 900
