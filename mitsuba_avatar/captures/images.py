@@ -20,6 +20,9 @@ IMAGE_EXTENSIONS: tuple[ImageExtension, ...] = ("png", "jpg", "avif", "exr")
 SAVE_OPTIONS = {".png": {"compress_level": 4}, ".jpg": {"quality": 95, "subsampling": 0}, ".avif": {"quality": 90, "subsampling": "4:4:4"}}
 # Modes whose values are 8 bits a channel; Pillow would silently squeeze the others (16-bit grey, float) into 8.
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX")
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_DEPTH_BYTE = 24  # of the header chunk: bits a channel
+HEADER_BYTES = PNG_DEPTH_BYTE + 1
 
 EncodedImage = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
 
@@ -31,7 +34,7 @@ def read_image(path: Path | str) -> EncodedImage:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: for a truncated file, one that is no image, or one with more than 8 bits a channel outside exr.
+        ValueError: for a truncated file, one that is no image, one with more than 8 bits a channel outside exr, or inks (CMYK).
     """
     path = _existing(path, "read_image")
     if path.suffix == ".exr":
@@ -108,6 +111,25 @@ def is_complete(path: Path | str) -> bool:
     return tail[-8:-4] == b"IEND" if path.suffix == ".png" else b"\xff\xd9" in tail
 
 
+def require_eight_bits(image: Image.Image, header: bytes, where: Path | str, caller: str) -> None:
+    """Refuse an opened image that a conversion to 8-bit grey or RGB would squeeze, or whose inks it would take for colours.
+
+    Args:
+        image: opened by Pillow.
+        header: the file's first `HEADER_BYTES` bytes or more: Pillow opens 16-bit colour PNG as 8-bit RGB without a word.
+        where, caller: for the message.
+
+    Raises:
+        ValueError: for more than 8 bits a channel, CMYK, or a mode of neither grey nor RGB.
+    """
+    depth = header[PNG_DEPTH_BYTE] if header.startswith(PNG_SIGNATURE) and len(header) >= HEADER_BYTES else 8
+    if image.mode not in EIGHT_BIT_MODES or depth > 8:
+        raise ValueError(
+            f"{caller}(): expected 8 bits a channel of grey or RGB in {where}; got Pillow mode {image.mode!r}, {depth} bits. "
+            "Store deeper images as linear exr or as 8 bits, CMYK as RGB, masks as 8-bit grey."
+        )
+
+
 def _boxes_fill_file(file, size: int) -> bool:
     """Walk the top-level boxes of an ISO base media file (ISO/IEC 14496-12): they must end exactly at the file's end."""
     position = 0
@@ -130,12 +152,8 @@ def _boxes_fill_file(file, size: int) -> bool:
 def _read_eight_bits(path: Path, mode: str, caller: str) -> UInt8[np.ndarray, "H W *channels"]:
     """Decode with Pillow into `mode`, refusing what would lose bits."""
     try:
-        with Image.open(path) as image:
-            if image.mode not in EIGHT_BIT_MODES:
-                raise ValueError(
-                    f"{caller}(): expected 8 bits a channel in {path}; got Pillow mode {image.mode!r}. "
-                    "Store deeper images as linear exr, masks as 8-bit grey."
-                )
+        with path.open("rb") as file, Image.open(path) as image:
+            require_eight_bits(image, file.read(HEADER_BYTES), path, caller)
             return np.array(image.convert(mode))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise _unreadable(path, error, caller) from error

@@ -1,5 +1,6 @@
 """Image files: formats, sizes, and every damage that must be noticed."""
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -60,8 +61,14 @@ def test_refusals(tmp_path):
     with pytest.raises(ValueError, match=r"a whole image in .*text.exr; got 5 bytes"):
         image_size(tmp_path / "text.exr")
     Image.fromarray(np.zeros((4, 6), np.uint16)).save(tmp_path / "deep.png")
-    with pytest.raises(ValueError, match=r"8 bits a channel in .*deep.png; got Pillow mode 'I;16'"):
+    with pytest.raises(ValueError, match=r"8 bits a channel of grey or RGB in .*deep.png; got Pillow mode 'I;16'"):
         read_mask(tmp_path / "deep.png")
+    cv2.imwrite(str(tmp_path / "deep_colour.png"), np.full((4, 6, 3), 1000, np.uint16))  # Pillow calls it RGB
+    with pytest.raises(ValueError, match=r"deep_colour.png; got Pillow mode 'RGB', 16 bits. Store deeper images"):
+        read_image(tmp_path / "deep_colour.png")
+    Image.new("CMYK", (6, 4)).save(tmp_path / "inks.jpg")
+    with pytest.raises(ValueError, match=r"inks.jpg; got Pillow mode 'CMYK'.*CMYK as RGB"):
+        read_image(tmp_path / "inks.jpg")
     with pytest.raises(ValueError, match="expected uint8 pixels for png, jpg and avif, float32 for exr; got float32"):
         write_image(tmp_path / "float.png", picture(np.float32))
     with pytest.raises(ValueError, match="got uint8 for .*a.bmp"):

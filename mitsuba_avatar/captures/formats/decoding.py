@@ -13,10 +13,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from PIL import Image, UnidentifiedImageError
 from trimesh.exchange.ply import load_ply
 
-from mitsuba_avatar.captures.images import EIGHT_BIT_MODES
-
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_DEPTH_BYTE = 24  # of the header chunk: bits a channel
+from mitsuba_avatar.captures.images import require_eight_bits
 
 
 def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "H W 3"]:
@@ -144,13 +141,7 @@ def _decoded(data: bytes, where: str, mode: Literal["RGB", "L", "labels"]) -> UI
     """Decode with Pillow, refusing what would lose bits or turn inks into colours."""
     try:
         with Image.open(io.BytesIO(data)) as image:
-            # Pillow opens 16-bit colour PNG as 8-bit RGB without a word; only the header tells.
-            depth = data[PNG_DEPTH_BYTE] if data.startswith(PNG_SIGNATURE) else 8
-            if image.mode not in EIGHT_BIT_MODES or depth > 8:
-                raise ValueError(
-                    f"decode_image(): expected 8 bits a channel of grey or RGB in {where}; got Pillow mode {image.mode!r}, {depth} bits. "
-                    "Convert deeper images to 8 bits, CMYK to RGB."
-                )
+            require_eight_bits(image, data, where, "decode_image")
             if mode == "labels":
                 return np.array(image if image.mode in ("L", "P") else image.convert("RGB").getchannel(0))
             return np.array(image.convert(mode))

@@ -234,7 +234,7 @@ BAD_IMAGES = {
     "no image": (lambda good: b"<html>404</html>", "it is no image"),
     "CMYK": (lambda good: encoded(Image.new("CMYK", (96, 72)), "JPEG"), "expected 8 bits a channel .*00000002.jpg; got Pillow mode 'CMYK'"),
     "16-bit grey": (lambda good: encoded(np.zeros((72, 96), np.uint16), "PNG"), "got Pillow mode 'I;16', 16 bits"),
-    "16-bit colour": (lambda good: sixteen_bit_colour(), "16 bits. Convert deeper images"),
+    "16-bit colour": (lambda good: sixteen_bit_colour(), "16 bits. Store deeper images"),
     "other size": (
         lambda good: encoded(np.zeros((72, 90, 3), np.uint8), "JPEG"),
         "expected 96x72 pixels, the size of cam02, in .*; got 90x72",
