@@ -20,12 +20,13 @@ from mitsuba_avatar.body.momentum_rig import face_signal, momentum_from_rig, mom
 from mitsuba_avatar.body.rig import Rig, load_rig, save_rig
 from mitsuba_avatar.body.skinning import posed_rest_surface
 from mitsuba_avatar.captures.arrays import open_frame_array
+from mitsuba_avatar.captures.cameras import UpAxis
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.captures.formats.conversion import ConversionOptions, convert, read_report, with_frames
 from mitsuba_avatar.captures.formats.goliath import GoliathSource
 from mitsuba_avatar.captures.formats.goliath_writer import GoliathBody, write_goliath
 from mitsuba_avatar.captures.formats.opening import FormatName, open_source
-from mitsuba_avatar.captures.formats.source import Source, SourceOptions, UpAxis
+from mitsuba_avatar.captures.formats.source import Source, SourceOptions
 from mitsuba_avatar.captures.images import ImageExtension
 from mitsuba_avatar.captures.writer import CaptureWriter
 from mitsuba_avatar.progress import tracked

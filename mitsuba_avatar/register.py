@@ -70,7 +70,7 @@ def register(folder: Path, out: Path, settings: RegistrationSettings) -> int:
         if (out / DESCRIPTION_FILE).exists():  # an earlier run stopped while it drew
             capture = Capture.open(out)
         else:
-            capture, quality = Registration(open_recording(folder), settings, out, progress.update).run()
+            capture, quality = Registration(open_recording(folder, settings.calibration), settings, out, progress.update).run()
             for name, value in summary(quality).items():
                 sys.stderr.write(f"{name}: {value}\n")
         pictures = overlay_pictures(capture, lambda done, total: progress.update("diagnostics", done, total))

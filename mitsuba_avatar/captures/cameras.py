@@ -9,13 +9,15 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from mitsuba_avatar.captures.rigid import inverse_rigid, is_rigid
 from mitsuba_avatar.files import atomic_path
+
+UpAxis = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]  # of a world that is not ours yet
 
 FORMAT_VERSION = 1
 LARGEST_RIG_METRES = 100.0  # no capture stage is larger; 3 m domes in centimetres or millimetres are

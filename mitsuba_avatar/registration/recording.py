@@ -1,7 +1,7 @@
 """A folder of synchronized videos, their calibration and their 2D keypoints, found and checked before any work.
 
 ```
-Calib.qca.txt  or  cameras.json              the calibration; its names of cameras are those of videos and folders
+cameras.json, Calib.qca.txt, ...             the calibration (calibration.py); its names of cameras are those of videos and folders
 <camera>.mp4                                 or mov, avi, mkv, webm; also in videos/
 keypoints_2d/<camera>/*.json                 a file a frame, as OpenPose writes them, in order of their names
 masks/<camera>/*.png                         optional: a file a frame, white is the person, at the video's size
@@ -12,9 +12,9 @@ chart/chart.json  chart/<camera>.png         optional: pictures of a colour char
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mitsuba_avatar.captures.cameras import Camera, load_cameras
-from mitsuba_avatar.captures.folder import CAMERAS_FILE
-from mitsuba_avatar.registration.qualisys import load_qualisys
+from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.registration.calibration import find_calibration
+from mitsuba_avatar.registration.settings import CalibrationSettings
 from mitsuba_avatar.registration.video import VideoInfo, probe_video
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
@@ -55,8 +55,12 @@ class Recording:
         return all(view.masks for view in self.views.values())
 
 
-def open_recording(path: Path | str) -> Recording:
+def open_recording(path: Path | str, settings: CalibrationSettings = CalibrationSettings()) -> Recording:  # noqa: B008 - frozen
     """Find and check the parts of a recording; decodes no image.
+
+    Args:
+        path: its folder.
+        settings: what the calibration's files do not say.
 
     Raises:
         FileNotFoundError: no folder, calibration, videos or keypoints.
@@ -66,20 +70,22 @@ def open_recording(path: Path | str) -> Recording:
     path = Path(path)
     if not path.is_dir():
         raise FileNotFoundError(f"open_recording(): expected a folder of videos at {path}; got none. Check the path.")
-    cameras = _calibration(path)
+    calibration = find_calibration(path)
     videos = {file.stem: file for folder in (path, path / "videos") for file in sorted(folder.glob("*")) if file.suffix in VIDEO_ENDINGS}
     if len(videos) < 2:
         raise FileNotFoundError(
             f"open_recording(): expected at least two videos in {path}; got {sorted(videos)}. Depth needs two views: put "
             f"<camera>{VIDEO_ENDINGS[0]} there."
         )
+    probed = {name: probe_video(file) for name, file in videos.items()}
+    cameras = calibration.cameras({name: (info.width, info.height) for name, info in probed.items()}, settings)
     uncalibrated = sorted(set(videos) - set(cameras))
     if uncalibrated:
         raise ValueError(
             f"open_recording(): expected every video's camera in the calibration of {path}; got none for {uncalibrated}. "
             f"It has {sorted(cameras)}. Rename the videos, calibrate those cameras, or take the videos away."
         )
-    infos = {name: probe_video(videos[name]) for name in cameras if name in videos}
+    infos = {name: probed[name] for name in cameras if name in probed}
     num_frames = _common_length(path, infos)
     views = {}
     for name, info in infos.items():
@@ -90,19 +96,6 @@ def open_recording(path: Path | str) -> Recording:
             masks=_files(path, MASKS_FOLDER, name, "png", num_frames) if (path / MASKS_FOLDER).is_dir() else (),
         )
     return Recording(path, views, num_frames, next(iter(infos.values())).fps)
-
-
-def _calibration(path: Path) -> dict[str, Camera]:
-    """Cameras of the folder's one calibration."""
-    if (path / CAMERAS_FILE).is_file():
-        return load_cameras(path / CAMERAS_FILE)
-    files = sorted(path.glob("*.qca.txt"))
-    if len(files) != 1:
-        raise FileNotFoundError(
-            f"open_recording(): expected one calibration, {CAMERAS_FILE} or *.qca.txt, in {path}; got {[file.name for file in files]}. "
-            "Put the one there that belongs to the videos."
-        )
-    return load_qualisys(files[0])
 
 
 def _common_length(path: Path, infos: dict[str, VideoInfo]) -> int:

@@ -142,7 +142,11 @@ class Registration:
 
     def _frames(self, cameras: dict[str, Camera]) -> FrameFolder:
         output = self.settings.output
-        key = stage_key(self.source_key, output.width, output.height)
+        # Corrections move cameras, which changes no pixel; another lens does.
+        lenses = [
+            dataclasses.astuple(dataclasses.replace(view.camera, camera_from_world=np.eye(4))) for view in self.recording.views.values()
+        ]
+        key = stage_key(self.source_key, lenses, output.width, output.height)
         frames = FrameFolder(self.stages.path / f"frames_{key}", cameras, self.recording.num_frames)
         if not self.stages.is_done("frames", key):
             undistort_videos(self.recording, frames, lambda *done: self.progress("undistort", *done))

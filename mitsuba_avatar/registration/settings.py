@@ -7,10 +7,22 @@ seconds otherwise.
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mitsuba_avatar.captures.cameras import UpAxis
 from mitsuba_avatar.settings import expect
 
 ColourCorrection = Literal["auto", "none", "gains", "affine"]
 KeypointOrder = Literal["auto", "body_25", "body_25b", "coco", "openpose_coco", "halpe_26"]
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """What a calibration's files may leave open."""
+
+    up: UpAxis = "auto"  # axis of its world that points up; auto: as the format says, else as the cameras stand
+    metres: float = 0.0  # in a unit of its world; 0: as the format says (COLMAP's has no unit)
+
+    def __post_init__(self) -> None:
+        expect(self, "zero or more", "metres")
 
 
 @dataclass(frozen=True)
@@ -129,6 +141,7 @@ class RefinementSettings:
 class RegistrationSettings:
     """All sections of a registration."""
 
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
     keypoints: KeypointSettings = field(default_factory=KeypointSettings)
     body: BodySettings = field(default_factory=BodySettings)

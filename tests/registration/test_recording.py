@@ -98,7 +98,7 @@ def test_missing_keypoints_are_named(tmp_path):
 def test_what_is_no_recording_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere; got none"):
         open_recording(tmp_path / "nowhere")
-    with pytest.raises(FileNotFoundError, match=r"cameras\.json or \*\.qca\.txt"):
+    with pytest.raises(FileNotFoundError, match=r"cameras\.json, \*\.qca\.txt"):
         open_recording(tmp_path)
     save_cameras(tmp_path / "cameras.json", make_cameras())
     with pytest.raises(FileNotFoundError, match="at least two videos"):

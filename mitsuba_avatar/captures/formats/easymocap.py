@@ -4,6 +4,7 @@ Cameras are world to camera in metres with pixel centres at integers; images kee
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,8 @@ from mitsuba_avatar.captures.formats.source import (
 )
 from mitsuba_avatar.captures.undistortion import Lens
 
+INTRINSICS_FILE = "intri.yml"
+EXTRINSICS_FILE = "extri.yml"
 FPS = 30.0
 MASK_FOLDERS = ("mask", "masks", "mask_cihp", "mask-schp")
 LACKS = ("the body: rig.npz, pose.npy, root.npy, face.npy, vertices.npy (SMPL parameters are no rig of ours)",)
@@ -99,9 +102,7 @@ def open_easymocap(path: Path | str, options: SourceOptions = SourceOptions()) -
     path = Path(path)
     folder = path / "images"
     recorded = sorted(entry.name for entry in folder.iterdir() if entry.is_dir()) if folder.is_dir() else []
-    intrinsics, extrinsics = read_opencv_yaml(path / "intri.yml"), read_opencv_yaml(path / "extri.yml")
-    listed = [str(name) for name in intrinsics.get("names") or []]
-    calibrated = [name for name in listed if f"K_{name}" in intrinsics and f"T_{name}" in extrinsics]
+    calibrated, intrinsics, extrinsics = _calibration(path)
     names, notes = chosen_cameras(calibrated, recorded, options.cameras, path)
     images = {name: files_by_number(folder / name) for name in names}
     mask_folder = next((path / name for name in MASK_FOLDERS if (path / name).is_dir()), path / MASK_FOLDERS[0])
@@ -127,12 +128,63 @@ def open_easymocap(path: Path | str, options: SourceOptions = SourceOptions()) -
     return EasyMocapSource(path, info, images, masks, turn)
 
 
+def read_easymocap_cameras(path: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[str, Camera]:
+    """Cameras of intri.yml and extri.yml alone, without images.
+
+    Args:
+        path: folder of both files.
+        sizes: (width, height) of the images or videos by name, where W_<name> and H_<name> do not say it; cameras without any size are
+            left out.
+
+    Returns:
+        name -> Camera with its distortion, in the calibration's world and unit.
+
+    Raises:
+        FileNotFoundError: if either file is missing.
+        ValueError: for files of another schema, no camera that both name, or a lens with more than five coefficients.
+    """
+    calibrated, intrinsics, extrinsics = _calibration(path)
+    if not calibrated:
+        raise ValueError(
+            f"read_easymocap_cameras(): expected names, K_<name> and T_<name> in {path / INTRINSICS_FILE} and {EXTRINSICS_FILE}; got "
+            f"{list(intrinsics)[:4]}. Write them with cv2.FileStorage under these names."
+        )
+    cameras = {}
+    for name in calibrated:
+        stated = _stated_size(name, intrinsics)
+        size = stated or sizes.get(name)
+        if size is None:
+            continue
+        lens = _lens(name, intrinsics, path)
+        if any(lens.coefficients[5:]):
+            raise ValueError(
+                f"read_easymocap_cameras(): expected at most k1, k2, p1, p2, k3 of {name} in {path / INTRINSICS_FILE}; got "
+                f"{len(lens.coefficients)} coefficients. Calibrate without the rational model."
+            )
+        camera = _camera(name, intrinsics, extrinsics, size, path)
+        cameras[name] = camera if lens.is_pinhole else replace(camera, distortion=lens.coefficients[:5])
+    return cameras
+
+
+def _calibration(path: Path) -> tuple[list[str], dict[str, Any], dict[str, Any]]:
+    """Names that both files calibrate, and the files' entries."""
+    intrinsics, extrinsics = read_opencv_yaml(path / INTRINSICS_FILE), read_opencv_yaml(path / EXTRINSICS_FILE)
+    listed = [str(name) for name in intrinsics.get("names") or []]
+    return [name for name in listed if f"K_{name}" in intrinsics and f"T_{name}" in extrinsics], intrinsics, extrinsics
+
+
+def _stated_size(name: str, intrinsics: Mapping[str, Any]) -> tuple[int, int] | None:
+    """(width, height) that the calibration was made at, if it says so."""
+    stated = tuple(intrinsics.get(f"{axis}_{name}") for axis in "WH")
+    return None if None in stated else (int(stated[0]), int(stated[1]))
+
+
 def _camera(name: str, intrinsics: Mapping[str, Any], extrinsics: Mapping[str, Any], size: tuple[int, int], path: Path) -> Camera:
     """A camera of both files, at the images' size, in the data set's world."""
-    stated = tuple(intrinsics.get(f"{axis}_{name}") for axis in "WH")
-    if None not in stated and tuple(map(int, stated)) != size:
+    stated = _stated_size(name, intrinsics)
+    if stated is not None and stated != size:
         raise ValueError(
-            f"open_easymocap(): expected images of {int(stated[0])}x{int(stated[1])} pixels for {name} by {path / 'intri.yml'}; got "
+            f"open_easymocap(): expected images of {stated[0]}x{stated[1]} pixels for {name} by {path / 'intri.yml'}; got "
             f"{size[0]}x{size[1]}. Scale K (and W, H) with the images."
         )
     rotation = extrinsics.get(f"Rot_{name}")
@@ -144,7 +196,7 @@ def _camera(name: str, intrinsics: Mapping[str, Any], extrinsics: Mapping[str, A
             )
         rotation = Rotation.from_rotvec(vector.ravel()).as_matrix()
     matrices = [np.asarray(value, dtype=np.float64) for value in (intrinsics[f"K_{name}"], rotation, extrinsics[f"T_{name}"])]
-    return camera_from_matrices(name, size, *matrices, path / "intri.yml")
+    return camera_from_matrices(name, size, *matrices, path / INTRINSICS_FILE)
 
 
 def _lens(name: str, intrinsics: Mapping[str, Any], path: Path) -> Lens:

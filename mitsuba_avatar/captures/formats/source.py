@@ -15,14 +15,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 
-from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.captures.cameras import Camera, UpAxis
 from mitsuba_avatar.captures.colour import ColourCurve
 from mitsuba_avatar.captures.formats.decoding import decode_image
 from mitsuba_avatar.captures.frames import Frame
 from mitsuba_avatar.captures.images import ImageExtension
 from mitsuba_avatar.captures.undistortion import Lens
 
-UpAxis = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
 LEAST_UPRIGHT = 0.4  # length of the cameras' mean up direction; below it they are rolled, or look from below as much as from above
 SNAP_ANGLE_DEG = 35.0  # the world's up is one of its axes if the cameras' mean up is as near to it as this
 TEST_SHARE = 0.1  # of the frames, where neither the data set nor the user says which are for testing
@@ -256,7 +255,7 @@ def upright_world(cameras: Iterable[Camera], up: UpAxis, where: Path) -> Float64
     if length < LEAST_UPRIGHT:
         raise ValueError(
             f"upright_world(): expected cameras that stand upright, to tell which way is up in {where}; got a mean up direction of "
-            f"length {length:.2f}. Say which axis points up (--up z, say)."
+            f"length {length:.2f}. Say which axis points up (--up z, say; calibration.up=z for register)."
         )
     direction /= length
     axis = int(np.abs(direction).argmax())
