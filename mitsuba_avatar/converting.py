@@ -57,6 +57,7 @@ class ConvertCommand:
         up: Axis of the data set's world that points up; default: as the cameras stand.
         distortion: Apply or ignore the stored lens coefficients; default: as the data set's own tools do.
         assets: Body model of Goliath captures (static_assets_body.pt or .npz); default: in or beside the capture.
+        own_sizes: Keep the size of each camera's images; default: all become as small as the smallest.
         links: Link to image files that need no change instead of copying them; the source must stay where it is.
         occlusion_size: Texels of the ambient occlusion maps written with --to goliath; 0 leaves them out.
     """
@@ -77,6 +78,7 @@ class ConvertCommand:
     up: UpAxis = "auto"
     distortion: Literal["auto", "apply", "ignore"] = "auto"
     assets: Path | None = None
+    own_sizes: bool = False
     links: bool = False
     occlusion_size: int = 0
 
@@ -103,7 +105,13 @@ def _import(command: ConvertCommand) -> None:
     source = with_frames(open_source(command.from_format, command.source, options), command.first_frame, command.last_frame)
     body = _MomentumBody(source) if isinstance(source, GoliathSource) and source.tracking_is_there else None
     conversion = ConversionOptions(
-        command.scale, command.held_out_cameras, command.image_extension, command.every, body is not None, command.links
+        command.scale,
+        command.held_out_cameras,
+        command.image_extension,
+        command.every,
+        writes_vertices=body is not None,
+        own_sizes=command.own_sizes,
+        links=command.links,
     )
     capture = (
         convert(source, command.destination, conversion, track=tracked)

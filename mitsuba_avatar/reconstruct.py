@@ -171,7 +171,6 @@ def _measure(
 ) -> dict:
     """Errors of all frames by method and camera group; writes reconstruction.json and reconstruction.png."""
     from mitsuba_avatar.progress import progress_bar
-    from mitsuba_avatar.reporting.evaluation import as_images
     from mitsuba_avatar.reporting.figures import View, comparison_grid, save_image
     from mitsuba_avatar.reporting.metrics import MetricsAccumulator
 
@@ -190,9 +189,9 @@ def _measure(
             if frame in shown:
                 place = names.index(held_out[len(views) % len(held_out)]) if held_out else 0
                 label = f"{names[place]} {capture.frames[frame].split} {capture.frames[frame].number}"
-                views.append(View(label, as_images(batch.images)[place], batch.masks[place, 0].numpy()))
+                views.append(View(label, batch.pictures(batch.images)[place], batch.coverage(batch.masks)[place]))
                 for method in METHODS:
-                    pictures[method].append(as_images(drawn[method].images)[place])
+                    pictures[method].append(batch.pictures(drawn[method].images)[place])
             rows.append(_row(loaded, frame, result))
             bar.update(done + 1)
     means = metrics.means()
@@ -207,15 +206,15 @@ def _add_metrics(
     metrics: "MetricsAccumulator", method: str, split: str, drawn: "DrawnState", batch: "FrameBatch", held_out: set[str]
 ) -> None:
     """Count every view that sees the person."""
-    from mitsuba_avatar.reporting.evaluation import as_images
     from mitsuba_avatar.reporting.metrics import image_metrics, silhouette_iou, vertex_error_mm
 
-    images, references, masks = as_images(drawn.images), as_images(batch.images), batch.masks[:, 0].numpy()
+    images, references, masks = batch.pictures(drawn.images), batch.pictures(batch.images), batch.coverage(batch.masks)
+    silhouettes = batch.coverage(drawn.masks)
     for view, name in enumerate(batch.camera_names[0]):
         if not masks[view].any():
             continue
         values = image_metrics(images[view], references[view], masks[view])
-        values["iou"] = silhouette_iou(drawn.masks[view, 0].numpy(), masks[view])
+        values["iou"] = silhouette_iou(silhouettes[view], masks[view])
         if batch.vertices is not None:
             values["vertex_mm"] = vertex_error_mm(drawn.vertices[0].numpy(), batch.vertices[0].numpy())
         metrics.add(method, split, "held_out" if name in held_out else "seen", values)

@@ -5,15 +5,18 @@ not black. Five cameras of 40x56 pixels, the last one held out; eight training a
 what was learnt can be compared with the truth.
 """
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
 from mitsuba_avatar.body.rig import Rig, save_rig
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.body.skinning import pose_vertices
-from mitsuba_avatar.captures.cameras import Camera, look_at
+from mitsuba_avatar.captures.cameras import Camera, look_at, save_cameras
 from mitsuba_avatar.captures.colour import encode_bytes
 from mitsuba_avatar.captures.description import CaptureDescription
 from mitsuba_avatar.captures.folder import Capture
@@ -80,6 +83,17 @@ def write_drawn_capture(path: Path, is_plain: bool = False) -> Capture:
     save_rig(rig_file, rig)
     writer.write_rig(rig_file)
     return writer.finish()
+
+
+def with_small_camera(capture: Capture, path: Path, name: str, width: int, height: int) -> Capture:
+    """A copy of a capture in which one camera's images are cut to their upper left corner: other sizes, the same pixels there."""
+    shutil.copytree(capture.path, path)
+    save_cameras(path / "cameras.json", capture.cameras | {name: replace(capture.cameras[name], width=width, height=height)})
+    for file in (*path.glob(f"images/{name}/*"), *path.glob(f"masks/{name}/*")):
+        with Image.open(file) as image:
+            cut = image.crop((0, 0, width, height))
+        cut.save(file)
+    return Capture.open(path)
 
 
 def _cameras() -> dict[str, Camera]:

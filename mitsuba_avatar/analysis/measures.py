@@ -30,7 +30,7 @@ from mitsuba_avatar.reporting.disentanglement import (
     linear_probe,
     other_frames,
 )
-from mitsuba_avatar.reporting.evaluation import Evaluator, as_images
+from mitsuba_avatar.reporting.evaluation import Evaluator
 from mitsuba_avatar.reporting.metrics import l1_in_mask, mse_in_mask, psnr_from_mse, silhouette_iou
 from mitsuba_avatar.training.statistics import evenly_spaced
 
@@ -73,11 +73,11 @@ def image_errors(evaluator: Evaluator, splits: Splits, progress: Progress = lamb
         for frame in frames:
             batch = evaluator.reader.read([frame], [names])
             drawn = evaluator.draw("avatar", batch)
-            pictures = zip(names, as_images(drawn.images), as_images(batch.images), drawn.masks, batch.masks, strict=True)
-            for name, image, captured, mask, captured_mask in pictures:
-                inside = captured_mask[0].numpy()
+            images, masks = (batch.pictures(values) for values in (drawn.images, batch.images)), (drawn.masks, batch.masks)
+            pictures = zip(names, *images, *(batch.coverage(values) for values in masks), strict=True)
+            for name, image, captured, mask, inside in pictures:
                 if inside.any():
-                    iou = silhouette_iou(mask[0].numpy(), inside)
+                    iou = silhouette_iou(mask, inside)
                     rows.append((mse_in_mask(image, captured, inside), l1_in_mask(image, captured, inside), iou, name in held_out))
             done += 1
             progress(done, total)

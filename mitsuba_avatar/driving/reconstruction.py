@@ -197,7 +197,7 @@ class Reconstructor:
         radiance, masks = renderer.render(
             output.vertices, output.textures[0], batch.cameras, seed=seed, background=batch.backgrounds.to(device)
         )
-        return DrawnState(encode(radiance, "srgb"), masks, output.vertices)
+        return DrawnState(batch.within_views(encode(radiance, "srgb")), batch.within_views(masks), output.vertices)
 
     def _occlusion(self, theta: Float[Tensor, "1 D"], seed: int) -> Float[Tensor, "1 1 S S"]:
         """Ambient occlusion of the posed template, without gradient."""
@@ -244,4 +244,5 @@ def _drawn_views(batch: FrameBatch, settings: ReconstructionSettings, step: int)
         masks=batch.masks[rows],
         backgrounds=batch.backgrounds[rows],
         cameras=cameras,
+        sizes=[batch.sizes[row] for row in rows.tolist()],
     )

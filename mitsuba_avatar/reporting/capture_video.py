@@ -21,6 +21,9 @@ def write_capture_video(capture: Capture, path: Path) -> None:
 
     def pictures() -> Iterator[UInt8[np.ndarray, "H W2 3"]]:
         for index in range(0, len(capture.frames), step):
-            yield np.concatenate([to_bytes(capture.display_image(name, index)) for name in names], axis=1)
+            pictures = [to_bytes(capture.display_image(name, index)) for name in names]
+            height = max(len(picture) for picture in pictures)
+            # A smaller camera's picture gets black rows below.
+            yield np.concatenate([np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0))) for picture in pictures], axis=1)
 
     write_video(path, pictures(), fps=capture.description.fps)

@@ -91,8 +91,8 @@ class Evaluator:
             vertices = avatar.pose_template(batch.theta, batch.root)
             textures = avatar.mean_texture.expand(len(batch.cameras), -1, -1, -1)
         radiance, masks = self.renderer.render(vertices, textures, batch.cameras, seed=batch.frames[0], background=batch.backgrounds)
-        images = encode(radiance, "srgb")
-        return Drawn(images.clamp(0, 1).cpu(), masks.cpu(), vertices[0].cpu(), textures[0].cpu())
+        images, masks = batch.within_views(encode(radiance, "srgb").clamp(0, 1)), batch.within_views(masks)
+        return Drawn(images.cpu(), masks.cpu(), vertices[0].cpu(), textures[0].cpu())
 
     def measure(
         self,
@@ -118,17 +118,17 @@ class Evaluator:
         for split, indices in frames.items():
             for index in indices:
                 batch = self.reader.read([index], [names])
-                references, masks = as_images(batch.images), batch.masks[:, 0].numpy()
+                references, masks = batch.pictures(batch.images), batch.coverage(batch.masks)
                 number = self.capture.frames[index].number
                 for method in methods:
                     drawn = self.draw(method, batch)
-                    images = as_images(drawn.images)
+                    images, silhouettes = batch.pictures(drawn.images), batch.coverage(drawn.masks)
                     of_frame = self._frame_metrics(drawn, batch, measures)
                     for view, name in enumerate(names):
                         if not masks[view].any():
                             continue  # the person is outside this camera's image
                         values = protocol_metrics(images[view], references[view], masks[view], measures.protocols, measures.has_flip)
-                        values["iou"] = silhouette_iou(drawn.masks[view, 0].numpy(), masks[view])
+                        values["iou"] = silhouette_iou(silhouettes[view], masks[view])
                         result.add(method, split, "held_out" if name in held_out else "seen", values | of_frame, (name, number))
                 done += 1
                 progress(done, total)
@@ -153,11 +153,11 @@ class Evaluator:
             for index in indices:
                 pair = self._neighbours(index)
                 batches = [self.reader.read([frame], [names]) for frame in pair]
-                references = np.stack([as_images(batch.images) for batch in batches], axis=1)  # [B, 2, H, W, 3]
-                masks = np.stack([batch.masks[:, 0].numpy() for batch in batches], axis=1)
+                references = _moments([batch.pictures(batch.images) for batch in batches])
+                masks = _moments([batch.coverage(batch.masks) for batch in batches])
                 number = self.capture.frames[index].number
                 for method in methods if len(pair) == 2 else ():
-                    images = np.stack([as_images(self.draw(method, batch).images) for batch in batches], axis=1)
+                    images = _moments([batch.pictures(self.draw(method, batch).images) for batch in batches])
                     for view, name in enumerate(names):
                         if masks[view].any():
                             values = {"flicker": temporal_flicker(images[view], references[view], masks[view])}
@@ -197,6 +197,11 @@ class Evaluator:
         nearest = self.reader.read([candidates[int(distance.argmin())]], batch.camera_names)
         vertices = None if nearest.vertices is None else nearest.vertices[0]
         return Drawn(nearest.images, nearest.masks, vertices)
+
+
+def _moments(pictures: Sequence[Sequence[Float[np.ndarray, "..."]]]) -> list[Float[np.ndarray, "2 ..."]]:
+    """For every view the pictures of all moments in one array; `pictures` lists the views of each moment."""
+    return [np.stack(of_view) for of_view in zip(*pictures, strict=True)]
 
 
 def as_images(images: Float[Tensor, "B C H W"]) -> Float[np.ndarray, "B H W C"]:

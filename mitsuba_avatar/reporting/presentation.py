@@ -15,6 +15,7 @@ from mitsuba_avatar.body.uv import UvAtlas
 from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.reporting.evaluation import METHODS, Evaluator, as_images
 from mitsuba_avatar.reporting.figures import Preview, View, comparison_grid, preview_panel, save_image
+from mitsuba_avatar.training.batches import FrameBatch
 
 SHADING_SIZE = 256  # texels of the texture that shows the mesh's shape
 BACKDROP = 0.18  # linear radiance behind the mesh of a preview: mid-grey
@@ -55,9 +56,9 @@ class Presentation:
             )
             previews.append(
                 Preview(
-                    view=self._view(shot, batch.images, batch.masks),
-                    render=as_images(drawn.images)[0],
-                    mesh=as_images(encode(mesh + (1 - mask) * BACKDROP, "srgb").clamp(0, 1))[0],
+                    view=self._view(shot, batch),
+                    render=batch.pictures(drawn.images)[0],
+                    mesh=batch.pictures(encode(mesh + (1 - mask) * BACKDROP, "srgb").clamp(0, 1))[0],
                     texture=as_images(encode(output.textures[0].clamp(0, 1), "srgb"))[0],
                     ambient_occlusion=batch.ambient_occlusion[0, 0].cpu().numpy(),
                     shadow=output.gain[0, 0].clamp(0, 1).cpu().numpy(),
@@ -70,9 +71,9 @@ class Presentation:
         views, pictures = [], {method: [] for method in METHODS}
         for shot in shots:
             batch = self.evaluator.reader.read([shot.frame], [[shot.camera]])
-            views.append(self._view(shot, batch.images, batch.masks))
+            views.append(self._view(shot, batch))
             for method in METHODS:
-                pictures[method].append(as_images(self.evaluator.draw(method, batch).images)[0])
+                pictures[method].append(batch.pictures(self.evaluator.draw(method, batch).images)[0])
         return comparison_grid(views, pictures)
 
     def save_held_out_pictures(self, folder: Path, shots: Sequence[Shot]) -> list[Path]:
@@ -82,12 +83,12 @@ class Presentation:
             batch = self.evaluator.reader.read([shot.frame], [[shot.camera]])
             number = self.evaluator.capture.frames[shot.frame].number
             paths.append(folder / f"{shot.camera}_{number:06d}.png")
-            save_image(paths[-1], as_images(self.evaluator.draw("avatar", batch).images)[0])
+            save_image(paths[-1], batch.pictures(self.evaluator.draw("avatar", batch).images)[0])
         return paths
 
-    def _view(self, shot: Shot, images: Float[Tensor, "1 3 H W"], masks: Float[Tensor, "1 1 H W"]) -> View:
+    def _view(self, shot: Shot, batch: FrameBatch) -> View:
         frame = self.evaluator.capture.frames[shot.frame]
-        return View(f"{shot.camera} {frame.split} {frame.number}", as_images(images)[0], masks[0, 0].cpu().numpy())
+        return View(f"{shot.camera} {frame.split} {frame.number}", batch.pictures(batch.images)[0], batch.coverage(batch.masks)[0])
 
     def _shaded(self, vertices: Float[Tensor, "P V 3"], centers: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 S S"]:
         """Grey textures lit from each camera: the shape alone."""

@@ -26,7 +26,7 @@ from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.reporting.aggregates import PER_CAMERA, PER_FRAME, grouped_means, joined_metrics, write_rows
 from mitsuba_avatar.reporting.comparison import inset_grid
 from mitsuba_avatar.reporting.curves import camera_bars, frame_curves, training_curves
-from mitsuba_avatar.reporting.evaluation import METHODS, Evaluator, as_images
+from mitsuba_avatar.reporting.evaluation import METHODS, Evaluator
 from mitsuba_avatar.reporting.figures import View, save_image
 from mitsuba_avatar.reporting.metrics import read_records
 from mitsuba_avatar.reporting.page import Figure, Section, write_page
@@ -153,13 +153,15 @@ class Report:
             batch = first.reader.read([frame], [[name]])
             if not batch.masks.any():
                 continue
-            views.append(View(f"{name} {first.capture.frames[frame].number}", as_images(batch.images)[0], batch.masks[0, 0].numpy()))
+            views.append(
+                View(f"{name} {first.capture.frames[frame].number}", batch.pictures(batch.images)[0], batch.coverage(batch.masks)[0])
+            )
             for run in self.runs:
                 shown = run.evaluator.reader.read([frame], [[name]])
                 label = "avatar" if self.is_alone else run.name
-                pictures.setdefault(label, []).append(as_images(run.evaluator.draw("avatar", shown).images)[0])
+                pictures.setdefault(label, []).append(shown.pictures(run.evaluator.draw("avatar", shown).images)[0])
             for method in METHODS[1:]:
-                pictures.setdefault(method, []).append(as_images(first.draw(method, batch).images)[0])
+                pictures.setdefault(method, []).append(batch.pictures(first.draw(method, batch).images)[0])
         if not views:
             raise ValueError(f"write_comparison(): expected views of the person in {first.capture.path}; got none. Check the masks.")
         path = self.folder / "comparison.png"

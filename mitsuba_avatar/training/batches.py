@@ -2,10 +2,13 @@
 
 What iteration i sees depends on the seed and i alone, so that a resumed run continues the same curve, and ranks of a distributed run
 take disjoint slices of one global batch. Symbols: P poses, N views a pose, B = P * N images.
+
+Cameras may differ in size. All are drawn on one film of the largest width W and height H, so that nothing is built or compiled anew; an
+image lies in its upper left corner, and what lies beyond is zero and counts nowhere (`FrameBatch.within_views`).
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -38,6 +41,7 @@ class FrameBatch:
         images: [B, 3, H, W] display-encoded (sRGB), as losses and metrics compare them. masks: [B, 1, H, W]. None without pictures.
         backgrounds: [B, 3, H, W] linear radiance; None without pictures.
         cameras: B cameras; None without pictures.
+        sizes: (width, height) of the B images; images, masks and backgrounds are zero beyond. None without pictures.
     """
 
     frames: list[int]
@@ -51,11 +55,35 @@ class FrameBatch:
     masks: Float[Tensor, "B 1 H W"] | None = None
     backgrounds: Float[Tensor, "B 3 H W"] | None = None
     cameras: CameraBatch | None = None
+    sizes: list[tuple[int, int]] | None = None
 
     @property
     def camera_centers(self) -> Float[Tensor, "P N 3"]:
         """[P, N, 3] metres, world axes."""
         return self.cameras.centers.view(len(self.frames), -1, 3).to(self.theta.device)
+
+    def within_views(self, values: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
+        """Rendered values with zeros beyond each view's image, as the batch's own have them: no loss then looks there.
+
+        Gradients: to the values within.
+        """
+        height, width = values.shape[2:]
+        if all(size == (width, height) for size in self.sizes):
+            return values
+        widths, heights = torch.tensor(self.sizes, device=values.device).unbind(1)
+        columns, rows = torch.arange(width, device=values.device), torch.arange(height, device=values.device)
+        is_inside = (columns < widths[:, None])[:, None, None] & (rows < heights[:, None])[:, None, :, None]
+        return torch.where(is_inside, values, 0.0)
+
+    def pictures(self, values: Float[Tensor, "B C H W"]) -> list[Float[np.ndarray, "h w C"]]:
+        """Images of the batch as numpy has them, each [h, w, C] at its own camera's size, from any device."""
+        return [
+            values[row, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy() for row, (width, height) in enumerate(self.sizes)
+        ]
+
+    def coverage(self, masks: Float[Tensor, "B 1 H W"]) -> list[Float[np.ndarray, "h w"]]:
+        """Masks of the batch as numpy has them, each [h, w] at its own camera's size."""
+        return [picture[..., 0] for picture in self.pictures(masks)]
 
     def to(self, device: torch.device) -> "FrameBatch":
         """The batch with its tensors on a device; cameras stay with the host, which only the renderer's set-up reads."""
@@ -70,6 +98,9 @@ BatchReader = Callable[[list[int], list[list[str]]], FrameBatch]  # from frames 
 class FrameReader:
     """Reads chosen frames and views of a capture as a batch.
 
+    Attributes:
+        width, height: of the film that holds every camera's image.
+
     Raises:
         FileNotFoundError, ValueError: the capture cannot be read as batches; see `check_readable`.
     """
@@ -77,8 +108,8 @@ class FrameReader:
     def __init__(self, capture: Capture, occlusion: FrameOcclusion):
         check_readable(capture)
         self.capture, self.occlusion = capture, occlusion
-        camera = next(iter(capture.cameras.values()))
-        self.width, self.height = camera.width, camera.height
+        self.width = max(camera.width for camera in capture.cameras.values())
+        self.height = max(camera.height for camera in capture.cameras.values())
 
     def read(self, frames: list[int], camera_names: list[list[str]]) -> FrameBatch:
         """Decode the images of P frames, N cameras each; raises what `Capture.image` raises, naming the file."""
@@ -89,7 +120,7 @@ class FrameReader:
                 mask = capture.mask(name, frame)
                 background = capture.background(name)
                 if background is None:
-                    background = np.zeros((self.height, self.width, 3), np.float32)
+                    background = np.zeros((*mask.shape, 3), np.float32)
                     images.append(encode(composited(capture.image(name, frame), mask, None), "srgb"))
                 else:
                     images.append(capture.display_image(name, frame))
@@ -99,10 +130,11 @@ class FrameReader:
         return dataclasses.replace(
             self.read_surfaces(frames, camera_names),
             ambient_occlusion=self.occlusion.maps(frames),
-            images=_channels_first(images),
-            masks=torch.from_numpy(np.stack(masks))[:, None],
-            backgrounds=_channels_first(backgrounds),
+            images=stacked_views(images, self.width, self.height),
+            masks=stacked_views([mask[..., None] for mask in masks], self.width, self.height),
+            backgrounds=stacked_views(backgrounds, self.width, self.height),
             cameras=CameraBatch.from_cameras(cameras),
+            sizes=[(camera.width, camera.height) for camera in cameras],
         )
 
     def read_surfaces(self, frames: list[int], camera_names: list[list[str]]) -> FrameBatch:
@@ -136,18 +168,12 @@ def check_readable(capture: Capture) -> None:
 
     Raises:
         FileNotFoundError: a driving signal or the masks are missing.
-        ValueError: the cameras' images have different sizes, or a camera is distorted.
+        ValueError: a camera is distorted.
     """
     check_driving(capture)
     if not (capture.path / "masks").is_dir():
         raise FileNotFoundError(
             f"check_readable(): expected masks in {capture.path / 'masks'}; got none. Segment the person in every image first."
-        )
-    sizes = {(camera.width, camera.height) for camera in capture.cameras.values()}
-    if len(sizes) != 1:
-        raise ValueError(
-            f"check_readable(): expected one image size in {capture.path / CAMERAS_FILE}; got {sorted(sizes)}. "
-            "Crop or resize the images (and their cameras) to one size."
         )
     distorted = [name for name, camera in capture.cameras.items() if camera.is_distorted]
     if distorted:
@@ -241,5 +267,9 @@ def _rows(values: Float[np.ndarray, "N *shape"], frames: list[int]) -> Float[Ten
     return torch.from_numpy(np.stack([values[i] for i in frames]).astype(np.float32))
 
 
-def _channels_first(images: list[Float[np.ndarray, "H W 3"]]) -> Float[Tensor, "B 3 H W"]:
-    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
+def stacked_views(images: Sequence[Float[np.ndarray, "_ _ C"]], width: int, height: int) -> Float[Tensor, "B C H W"]:
+    """Images of several sizes on one film: each in the upper left corner, zeros beyond. Pixels keep their coordinates."""
+    film = torch.zeros(len(images), images[0].shape[2], height, width)
+    for row, image in enumerate(images):
+        film[row, :, : image.shape[0], : image.shape[1]] = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
+    return film

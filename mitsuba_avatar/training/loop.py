@@ -249,8 +249,8 @@ class Trainer:
             textures = output.textures.flatten(0, 1)
             image, mask = self.renderer.render(output.vertices, textures, batch.cameras, seed=seed, background=batch.backgrounds)
         return LossInputs(
-            image=encode(image, "srgb"),
-            mask=mask,
+            image=batch.within_views(encode(image, "srgb")),
+            mask=batch.within_views(mask),
             target_image=batch.images,
             target_mask=batch.masks,
             vertices=output.vertices,

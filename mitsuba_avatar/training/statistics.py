@@ -12,7 +12,7 @@ from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.model.avatar import DrivingStatistics
 from mitsuba_avatar.rendering.cameras import CameraBatch
 from mitsuba_avatar.rendering.texture_projection import TextureProjection
-from mitsuba_avatar.training.batches import composited
+from mitsuba_avatar.training.batches import composited, stacked_views
 
 MESHES = 64  # frames whose mesh enters the mean shape
 TEXTURES = 24  # frames whose images enter the mean texture
@@ -65,13 +65,14 @@ def _mean_texture(capture: Capture, rig: Rig, texture_size: int, progress: Calla
     projection = TextureProjection(rig.topology, texture_size)
     names = capture.camera_names(held_out=False)
     cameras = CameraBatch.from_cameras([capture.cameras[name] for name in names])
+    film = max(capture.cameras[name].width for name in names), max(capture.cameras[name].height for name in names)
     for done, i in enumerate(frames):
         masks = [capture.mask(name, i) for name in names]
         images = [composited(capture.image(name, i), mask, capture.background(name)) for name, mask in zip(names, masks, strict=True)]
         projection.add(
             registered_vertices(capture, rig, skeleton, i),
-            torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous(),
-            torch.from_numpy(np.stack(masks))[:, None],
+            stacked_views(images, *film),
+            stacked_views([mask[..., None] for mask in masks], *film),
             cameras,
         )
         progress(done + 1, len(frames))

@@ -1,5 +1,7 @@
 """Measuring an avatar: the baselines are what they say, and every number is filed where it belongs."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +9,9 @@ import torch
 from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.reporting.evaluation import EVERY_MEASURE, METHODS, as_images
 from mitsuba_avatar.reporting.metrics import image_metrics, load_pictures, silhouette_iou, temporal_flicker
+from mitsuba_avatar.reporting.protocols import protocol_metrics
 from mitsuba_avatar.reporting.seams import SeamSampler
-from tests.drawn_capture import BACKGROUND, HEIGHT, HELD_OUT, TRAIN_FRAMES, WIDTH
+from tests.drawn_capture import BACKGROUND, HEIGHT, HELD_OUT, TRAIN_FRAMES, WIDTH, with_small_camera
 
 VIEWS = ["left", HELD_OUT, "front"]
 
@@ -61,6 +64,25 @@ def test_numbers_are_those_of_the_single_pictures(evaluator, drawn_capture):
     assert list(means) == ["seen"] and means["seen"]["images"] == 4
     for name, values in expected.items():
         assert means["seen"][name] == pytest.approx(np.mean(values), rel=1e-5), name
+
+
+def test_a_smaller_camera_is_measured_on_its_own_pixels(loaded, evaluator, drawn_capture, tmp_path):
+    """Another size changes nothing for the other cameras; for itself, errors are those of the cut pictures."""
+    capture = with_small_camera(drawn_capture, tmp_path / "copy", "right", 31, 44)
+    cut = dataclasses.replace(loaded, capture=capture).evaluator()
+    names, batch = ["right", "back"], evaluator.reader.read([2], [["right", "back"]])
+    drawn = evaluator.draw("avatar", batch)
+    images, references, masks = (values.numpy()[:, :, :44, :31] for values in (drawn.images, batch.images, batch.masks))
+    rows = {
+        name: cut.measure({"train": [2]}, ["avatar"], [name], measures=EVERY_MEASURE).means()["avatar"]["train"]["seen"] for name in names
+    }
+    expected = protocol_metrics(images[0].transpose(1, 2, 0), references[0].transpose(1, 2, 0), masks[0, 0])
+    for metric, value in expected.items():
+        assert rows["right"][metric] == pytest.approx(value, rel=0.05), metric
+    whole = evaluator.measure({"train": [2]}, ["avatar"], ["back"]).means()["avatar"]["train"]["seen"]
+    assert rows["back"]["psnr"] == pytest.approx(whole["psnr"], rel=1e-5)
+    flicker = cut.measure_flicker({"train": [2]}, ["nearest_frame"], names).means()["nearest_frame"]["train"]["seen"]
+    assert flicker["images"] == 2 and np.isfinite(flicker["flicker"])
 
 
 def test_cameras_and_splits_are_told_apart(evaluator):

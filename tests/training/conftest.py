@@ -14,6 +14,7 @@ from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.distributed import Process
 from mitsuba_avatar.training.loop import Trainer
 from mitsuba_avatar.training.statistics import training_statistics
+from tests.drawn_capture import with_small_camera
 
 
 @pytest.fixture(scope="session")
@@ -32,6 +33,13 @@ def reader(drawn_capture: Capture, rig: Rig, tmp_path_factory: pytest.TempPathFa
     baker = AmbientOcclusion(rig.topology, resolve("tiny").model.shadow_size, rays=8)
     folder = tmp_path_factory.mktemp("occlusion")
     return FrameReader(drawn_capture, FrameOcclusion(baker, rig, torch.from_numpy(rig.rest_vertices), drawn_capture.theta, folder))
+
+
+@pytest.fixture(scope="session")
+def two_sizes_reader(drawn_capture: Capture, reader: FrameReader, tmp_path_factory: pytest.TempPathFactory) -> FrameReader:
+    """Reads the drawn capture with the images of camera "left" cut to 25x39 pixels."""
+    folder = tmp_path_factory.mktemp("two_sizes")
+    return FrameReader(with_small_camera(drawn_capture, folder / "capture", "left", 25, 39), reader.occlusion)
 
 
 @pytest.fixture

@@ -91,7 +91,25 @@ def test_surfaces_are_read_without_images_and_occlusion(reader, monkeypatch):
     batch = reader.read_surfaces(frames, names).to(torch.device("cpu"))
     assert (batch.frames, batch.camera_names) == (frames, names)
     assert all(torch.equal(getattr(batch, name), getattr(whole, name)) for name in ("theta", "root", "face", "vertices"))
-    assert all(getattr(batch, name) is None for name in ("images", "masks", "backgrounds", "cameras", "ambient_occlusion"))
+    assert all(getattr(batch, name) is None for name in ("images", "masks", "backgrounds", "cameras", "ambient_occlusion", "sizes"))
+
+
+def test_images_of_another_size_lie_in_the_corner_of_one_film(reader, two_sizes_reader):
+    names = [["left", "front"], ["back", "left"]]
+    batch, whole = two_sizes_reader.read([5, 2], names), reader.read([5, 2], names)
+    assert batch.sizes == [(25, 39), (WIDTH, HEIGHT), (WIDTH, HEIGHT), (25, 39)]
+    for part in ("images", "masks", "backgrounds"):
+        values, expected = getattr(batch, part), getattr(whole, part)
+        assert values.shape == expected.shape and torch.equal(values[1:3], expected[1:3])
+        for row in (0, 3):
+            assert torch.equal(values[row, :, :39, :25], expected[row, :, :39, :25]) and expected[row, :, 39:].any()
+            assert not values[row, :, 39:].any() and not values[row, :, :, 25:].any()
+        assert torch.equal(batch.within_views(expected), values)
+    assert torch.equal(batch.cameras.intrinsics, whole.cameras.intrinsics), "the corner stays where it was"
+    pictures, coverage = batch.pictures(whole.images), batch.coverage(whole.masks)
+    assert [picture.shape for picture in pictures] == [(39, 25, 3), (HEIGHT, WIDTH, 3), (HEIGHT, WIDTH, 3), (39, 25, 3)]
+    np.testing.assert_array_equal(coverage[3], whole.masks[3, 0, :39, :25])
+    assert whole.within_views(whole.images) is whole.images, "nothing to do where all have one size"
 
 
 def test_images_over_an_unknown_background_are_put_on_black(reader, drawn_capture, tmp_path):
@@ -168,7 +186,6 @@ def edit_camera(folder, **changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"width": 64}, r"expected one image size in .*cameras\.json; got \[\(40, 56\), \(64, 56\)\]\. Crop or resize"),
         ({"distortion": [0.1, 0, 0, 0]}, r"expected pinhole cameras in .*cameras\.json; got distortion for \['right'\]\. Undistort"),
     ],
 )

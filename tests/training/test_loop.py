@@ -10,6 +10,7 @@ from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.checkpoints import Checkpoints
 from mitsuba_avatar.training.distributed import Process
 from mitsuba_avatar.training.loop import DivergedError, MetricsLog, StepTimer
+from mitsuba_avatar.training.losses import evaluate_losses
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -83,6 +84,21 @@ def test_parts_may_be_left_out(make_trainer, reader, override, vertices, terms):
     changes = {} if vertices is ... else {"vertices": vertices}
     trainer = make_trainer(override, "training.iterations=2", reader=MemoryReader(reader, **changes))
     assert [list(record) for record in run(trainer)] == [terms, terms]
+
+
+def test_pixels_beyond_a_smaller_image_count_nowhere(make_trainer, two_sizes_reader):
+    """What is drawn there is not looked at: the loss is that of the pixels within."""
+    frames, names = [3, 6], [["left", "front"], ["right", "left"]]
+    trainer = make_trainer("loss.geometry=0", "loss.laplacian=0", "loss.kl=0", reader=two_sizes_reader)
+    batch = two_sizes_reader.read(frames, names)
+    with torch.no_grad():
+        inputs = trainer._rendered(batch, trainer.latent_noise(2))
+        terms = evaluate_losses(inputs, {"image": 1.0, "mask": 1.0})
+    within = batch.within_views(torch.ones_like(batch.images)) > 0
+    assert not inputs.image[~within].any() and not inputs.mask[~within[:, :1]].any()
+    expected = (inputs.image - batch.images).abs()[within].sum() / (3 * batch.masks.sum())
+    assert float(terms["image"]) == pytest.approx(float(expected), rel=1e-5)
+    assert float(trainer.step(batch)["loss"]) > 0
 
 
 def test_an_image_that_is_not_a_number_is_named(make_trainer, reader):

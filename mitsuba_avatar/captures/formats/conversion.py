@@ -6,7 +6,7 @@ resized in linear light. An interrupted conversion resumes; `capture.yaml` comes
 
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -42,6 +42,7 @@ class ConversionOptions:
         image_extension: of the images to write; empty keeps the source's.
         every: keep each so-manieth frame.
         writes_vertices: whether registered meshes are written; their topology must come with a rig.
+        own_sizes: whether every camera keeps the size of its images; otherwise all get that of the smallest.
         links: whether image files that need no change are linked to instead of copied, where the source has them as files.
     """
 
@@ -50,6 +51,7 @@ class ConversionOptions:
     image_extension: ImageExtension | None = None
     every: int = 1
     writes_vertices: bool = False
+    own_sizes: bool = False
     links: bool = False
 
 
@@ -81,7 +83,7 @@ def convert(
         raise ValueError(f"convert(): expected 0 < scale <= 1 and every >= 1; got {options.scale} and {options.every}. Correct them.")
     info = source.info
     indices = tuple(range(0, len(info.frames), options.every))
-    cameras = straight_cameras(info.cameras, info.lenses, options.scale)
+    cameras = straight_cameras(info.cameras, info.lenses, options.scale, options.own_sizes)
     description = CaptureDescription(
         name=info.name,
         fps=info.fps / options.every,
@@ -106,12 +108,16 @@ def convert(
     return writer.finish()
 
 
-def straight_cameras(cameras: dict[str, Camera], lenses: dict[str, Lens], scale: float) -> dict[str, Camera]:
-    """Cameras of the converted images: without distortion, all of one size.
+def straight_cameras(
+    cameras: Mapping[str, Camera], lenses: Mapping[str, Lens], scale: float = 1.0, own_sizes: bool = True
+) -> dict[str, Camera]:
+    """Cameras of the converted images: without distortion, each at its own size times `scale`, or all at one.
 
-    Where sizes differ, that of the smallest image is taken and larger ones are resized and cut to its shape, so that every pixel has
-    a source.
+    One size is that of the smallest image; larger ones are resized and cut to its shape, so that every pixel has a source.
     """
+    if own_sizes:
+        sizes = {name: (max(1, round(scale * camera.width)), max(1, round(scale * camera.height))) for name, camera in cameras.items()}
+        return {name: undistorted_camera(camera, lenses.get(name, Lens()), *sizes[name]) for name, camera in cameras.items()}
     smallest = min(cameras.values(), key=lambda camera: camera.width * camera.height)
     width, height = max(1, round(scale * smallest.width)), max(1, round(scale * smallest.height))
     return {name: undistorted_camera(camera, lenses.get(name, Lens()), width, height) for name, camera in cameras.items()}

@@ -117,6 +117,13 @@ def test_an_image_of_twice_the_size_is_brought_to_the_others(data_sets, tmp_path
     assert capture.camera_names(held_out=True) == ["3"]
 
 
+def test_cameras_may_keep_their_own_sizes(data_sets, tmp_path):
+    path, scene = data_sets["easymocap"]
+    capture = convert(open_source("easymocap", path), tmp_path / "own", ConversionOptions(own_sizes=True))
+    assert [(camera.width, camera.height) for camera in capture.cameras.values()] == [(96, 72), (192, 150), (96, 72)]
+    assert largest_error(capture, scene) < 0.15
+
+
 def test_keypoints_of_one_person_come_along(data_sets, tmp_path):
     path, scene = data_sets["easymocap"]
     source = open_source("easymocap", path)
