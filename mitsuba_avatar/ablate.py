@@ -12,7 +12,7 @@ from mitsuba_avatar.ablation.plan import REHEARSAL, plan_runs
 from mitsuba_avatar.ablation.rows import choose_rows
 from mitsuba_avatar.ablation.schedule import default_jobs, run_workers
 from mitsuba_avatar.ablation.table import markdown, write_tables
-from mitsuba_avatar.command_line import parse_command
+from mitsuba_avatar.command_line import interruptible, parse_command
 from mitsuba_avatar.files import check_writable
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.presets import resolve
@@ -35,6 +35,7 @@ class AblateCommand:
     variant: str = "auto"  # Mitsuba variant, for filming
 
 
+@interruptible("ablate", kept="every run is saved. Give the same command again to go on.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     try:
@@ -55,9 +56,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError, RuntimeError, backend.BackendError) as error:
         sys.stderr.write(f"ablate: {error}\n")
         return 2
-    except KeyboardInterrupt:
-        sys.stderr.write("ablate: interrupted; every run is saved. Give the same command again to go on.\n")
-        return 130
 
 
 def _study(variant: str) -> Path:

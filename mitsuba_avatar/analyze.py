@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.files import atomic_path, check_writable
 from mitsuba_avatar.progress import StageProgress
 from mitsuba_avatar.rendering import backend
@@ -35,6 +36,7 @@ class AnalyzeCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("analyze", kept="finished files are whole and kept. Give the same command again to write all of them.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(AnalyzeCommand, args=arguments)

@@ -22,6 +22,7 @@ import tyro
 
 from mitsuba_avatar.benchmarking.workload import Workload, make_workload
 from mitsuba_avatar.body.rig import Rig
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.rendering import backend
 
@@ -58,6 +59,7 @@ class Row:
     primary_ms: float
 
 
+@interruptible("bench", kept="nothing is kept. Give the same command again to measure anew.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(BenchCommand, args=arguments)

@@ -28,6 +28,7 @@ from mitsuba_avatar.captures.contact_sheet import Tile, overlay, save_contact_sh
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.captures.reprojection import Diagnosis, Observation, diagnose
 from mitsuba_avatar.captures.rigid import inverse_rigid
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.converting import ConvertCommand, run_conversion
 from mitsuba_avatar.progress import tracked
 from mitsuba_avatar.rendering.backend import BackendError
@@ -250,6 +251,7 @@ def _count_and_bytes(folder: Path) -> tuple[int, int]:
     return len(sizes), sum(sizes)
 
 
+@interruptible("capture", kept="finished files are whole and kept. Give the same command again to write all of them.")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 if all is well, 1 with one line on the error stream if the capture is not usable."""
     try:

@@ -3,11 +3,16 @@
     python -m mitsuba_avatar.fit --config tiny training.iterations 50 model.decoder_channels=32,16
 
 Flags are the fields of a small dataclass, read by tyro; every other word is an override (`presets.resolve` says how it is written).
+A command that is ended from outside says in one line what is kept (`interruptible`).
 """
 
 import dataclasses
+import functools
 import re
-from collections.abc import Sequence
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import tyro
@@ -15,6 +20,36 @@ import tyro
 from mitsuba_avatar.presets import nearest_key, setting_types
 
 CommandType = TypeVar("CommandType")
+Main = Callable[[Sequence[str] | None], int]  # a command's `main`: words after its name -> exit status
+
+INTERRUPTED = 130  # exit status: 128 + SIGINT, as shells have it
+
+
+def interruptible(name: str, kept: str) -> Callable[[Main], Main]:
+    """Decorator of a command's `main`: Ctrl-C and SIGTERM unwind it, so that half-written files go, and end in one line and status 130.
+
+    Args:
+        name: of the command.
+        kept: what is there afterwards, and how to go on; a sentence after "interrupted; ".
+    """
+
+    def decorate(main: Main) -> Main:
+        @functools.wraps(main)
+        def run(arguments: Sequence[str] | None = None) -> int:
+            is_main_thread = threading.current_thread() is threading.main_thread()  # no other may set handlers
+            previous = signal.signal(signal.SIGTERM, signal.default_int_handler) if is_main_thread else None
+            try:
+                return main(arguments)
+            except KeyboardInterrupt:
+                sys.stderr.write(f"{name}: interrupted; {kept}\n")
+                return INTERRUPTED
+            finally:
+                if is_main_thread:
+                    signal.signal(signal.SIGTERM, previous)
+
+        return run
+
+    return decorate
 
 
 def parse_command(command: type[CommandType], settings: type, arguments: Sequence[str] | None = None) -> tuple[CommandType, list[str]]:

@@ -16,6 +16,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.files import atomic_path, check_writable
 from mitsuba_avatar.rendering import backend
 
@@ -64,6 +65,7 @@ class DriveCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("drive", kept="finished files are whole and kept. Give the same command again to write all of them.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(DriveCommand, args=arguments)

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.files import check_writable
 from mitsuba_avatar.rendering import backend
 
@@ -30,6 +31,7 @@ class EvaluateCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("evaluate", kept="finished files are whole and kept. Give the same command again to write all of them.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(EvaluateCommand, args=arguments)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.files import atomic_path, check_writable
 from mitsuba_avatar.rendering import backend
 
@@ -42,6 +43,7 @@ class ExportCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("export", kept="finished files are whole and kept. Give the same command again to write all of them.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(ExportCommand, args=arguments)

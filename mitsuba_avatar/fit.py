@@ -19,7 +19,7 @@ from typing import Annotated  # noqa: E402
 
 import tyro  # noqa: E402
 
-from mitsuba_avatar.command_line import parse_command  # noqa: E402
+from mitsuba_avatar.command_line import interruptible, parse_command  # noqa: E402
 from mitsuba_avatar.presets import resolve  # noqa: E402
 from mitsuba_avatar.rendering import backend  # noqa: E402
 from mitsuba_avatar.settings import Settings  # noqa: E402
@@ -37,6 +37,7 @@ class FitCommand:
     variant: str = ""  # Mitsuba variant; default: the setting rendering.variant
 
 
+@interruptible("fit", kept="nothing was trained yet. Give the same command again.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     try:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.rendering import backend
 
@@ -50,6 +51,7 @@ class ReconstructCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("reconstruct", kept="finished frames are kept. Give the same command again to go on.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(ReconstructCommand, args=arguments)

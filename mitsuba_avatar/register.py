@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from mitsuba_avatar.command_line import parse_command
+from mitsuba_avatar.command_line import interruptible, parse_command
 from mitsuba_avatar.files import check_writable
 from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.progress import StageProgress
@@ -32,6 +32,7 @@ class RegisterCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("register", kept="finished stages are kept. Give the same command again to go on.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     try:
@@ -44,9 +45,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError, backend.BackendError) as error:
         sys.stderr.write(f"register: {error}\n")
         return 2
-    except KeyboardInterrupt:
-        sys.stderr.write("register: interrupted; finished stages are kept. Give the same command again to go on.\n")
-        return 130
 
 
 def register(folder: Path, out: Path, settings: RegistrationSettings) -> int:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.rendering import backend
 
@@ -63,6 +64,7 @@ class RenderCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("render", kept="finished pictures are kept. Give the same command again to go on.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(RenderCommand, args=arguments)

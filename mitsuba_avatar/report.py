@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.files import check_writable
 from mitsuba_avatar.rendering import backend
 
@@ -32,6 +33,7 @@ class ReportCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("report", kept="finished files are whole and kept. Give the same command again to write all of them.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(ReportCommand, args=arguments)

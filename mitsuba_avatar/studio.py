@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from mitsuba_avatar.command_line import parse_command
+from mitsuba_avatar.command_line import interruptible, parse_command
 from mitsuba_avatar.filming.plan import LONG, Shard, plan_filming
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.presets import resolve
@@ -30,6 +30,7 @@ class StudioCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("studio", kept="what was filmed is kept. Give the same command again to go on.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     try:
@@ -48,9 +49,6 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError, backend.BackendError) as error:
         sys.stderr.write(f"studio: {error}\n")
         return 2
-    except KeyboardInterrupt:
-        sys.stderr.write("studio: interrupted; what was filmed is kept. Give the same command again to go on.\n")
-        return 130
 
 
 def film(settings: StudioSettings, out: str, shard: Shard) -> int:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mitsuba_avatar.command_line import interruptible
 from mitsuba_avatar.rendering import backend
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class ViewCommand:
     variant: str = "auto"  # Mitsuba variant
 
 
+@interruptible("view", kept="a viewer keeps nothing. Give the same command again.")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     command = tyro.cli(ViewCommand, args=arguments)

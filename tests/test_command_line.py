@@ -1,10 +1,15 @@
 """One line of words becomes a command's flags and the overrides of settings; a word that is neither is refused."""
 
+import ast
+import os
+import signal
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
-from mitsuba_avatar.command_line import parse_command
+import mitsuba_avatar
+from mitsuba_avatar.command_line import interruptible, parse_command
 from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.settings import Settings
 
@@ -43,3 +48,31 @@ def test_help_lists_flags_and_settings(capsys):
     assert "Fit an avatar." in shown
     assert "--resume" in shown
     assert f"training.iterations ({Settings().training.iterations})" in shown
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_is_ended_says_in_one_line_what_is_kept(number, capsys):
+    unwound, before = [], signal.getsignal(signal.SIGTERM)
+
+    @interruptible("juggle", kept="two balls are kept. Pick up the third.")
+    def main(arguments=None):
+        try:
+            os.kill(os.getpid(), number)
+            signal.pause()
+        finally:
+            unwound.append(arguments)
+
+    assert main(["balls"]) == 130 and unwound == [["balls"]]
+    assert capsys.readouterr().err == "juggle: interrupted; two balls are kept. Pick up the third.\n"
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_every_command_that_works_for_long_is_interruptible():
+    decorated = {}
+    for path in sorted(Path(mitsuba_avatar.__file__).parent.glob("*.py")):
+        mains = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef) and node.name == "main"]
+        for main in mains:
+            calls = [call for call in main.decorator_list if isinstance(call, ast.Call) and call.func.id == "interruptible"]
+            decorated[path.stem] = [call.args[0].value for call in calls]
+    assert len(decorated) >= 14
+    assert {name: names for name, names in decorated.items() if names != [name]} == {"doctor": []}

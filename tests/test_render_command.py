@@ -1,7 +1,9 @@
 """`python -m mitsuba_avatar.render`: pictures, EXR layers and video of a finished run."""
 
 import json
+import os
 import shutil
+import signal
 
 import av
 import numpy as np
@@ -189,3 +191,29 @@ def test_a_video_waits_for_the_other_shard(fitted_run, private_cache, tmp_path, 
     assert main([*words, "--shard", "1/2"]) == 0
     assert "waits for 2 pictures" in capsys.readouterr().err and not (tmp_path / "out.mp4").exists()
     assert main([*words, "--shard", "0/2"]) == 0 and (tmp_path / "out.mp4").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_killed_render_leaves_whole_files_and_goes_on(fitted_run, private_cache, tmp_path, capsys, monkeypatch, number):
+    """The signal comes while the third picture's bytes are written."""
+    out, save, saved = tmp_path / "out", Image.Image.save, []
+
+    def killed_in_the_third(picture, target, *arguments, **options):
+        saved.append(target)
+        save(picture, target, *arguments, **options)
+        if len(saved) == 3:
+            os.truncate(target, os.path.getsize(target) // 2)
+            os.kill(os.getpid(), number)
+
+    words = [str(fitted_run), *SMALL, "--out", str(out)]
+    with monkeypatch.context() as patch:
+        patch.setattr(Image.Image, "save", killed_in_the_third)
+        assert main(words) == 130
+    assert "render: interrupted; finished pictures are kept. Give the same command again to go on." in capsys.readouterr().err
+    left = {path.name: path.read_bytes() for path in out.iterdir()}
+    times = {name: (out / name).stat().st_mtime_ns for name in left}
+    assert len([name for name in left if name.endswith(".png")]) == 2 and not [name for name in left if name.startswith(".")]
+    assert main(words) == 0
+    pictures = sorted(out.glob("*.png"))
+    assert len(pictures) == 4 and {read_image(path).shape for path in pictures} == {(44, 30, 3)}
+    assert all((out / name).stat().st_mtime_ns == times[name] for name in left if name.endswith(".png")), "they are not drawn again"
