@@ -16,7 +16,7 @@ from mitsuba_avatar.rendering import backend
 
 if TYPE_CHECKING:
     from mitsuba_avatar.loaded_run import LoadedRun
-    from mitsuba_avatar.viewing.session import Material
+    from mitsuba_avatar.viewing.session import ViewedAvatar
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def _view(command: ViewCommand) -> int:
     from mitsuba_avatar.viewing.session import ViewerSession
 
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
-    session = ViewerSession(open_material(loaded, command.motion, command.checkpoint))
+    session = ViewerSession(open_viewed_avatar(loaded, command.motion, command.checkpoint))
     if command.measure:
         figures = session.measure(command.measure, round(command.height * 4 / 3), command.height)
         parts = ", ".join(f"{name.removesuffix('_ms')} {value:.0f} ms" for name, value in figures.items() if name.endswith("_ms"))
@@ -78,7 +78,7 @@ def _view(command: ViewCommand) -> int:
     return 0
 
 
-def open_material(loaded: "LoadedRun", motion: str = "", checkpoint: str = "last") -> "Material":
+def open_viewed_avatar(loaded: "LoadedRun", motion: str = "", checkpoint: str = "last") -> "ViewedAvatar":
     """What a viewer shows of a run: its training and test poses, latent codes where they can be had, and a timeline.
 
     Args:
@@ -96,7 +96,7 @@ def open_material(loaded: "LoadedRun", motion: str = "", checkpoint: str = "last
     from mitsuba_avatar.driving.signals import DrivingSignals
     from mitsuba_avatar.driving.sources import load_body
     from mitsuba_avatar.driving.training_latents import training_latents
-    from mitsuba_avatar.viewing.session import MOST_NAMED_FACE_ENTRIES, Material
+    from mitsuba_avatar.viewing.session import MOST_NAMED_FACE_ENTRIES, ViewedAvatar
 
     run, capture = loaded.run, loaded.capture
     splits = {frame.split for frame in capture.frames}
@@ -120,7 +120,7 @@ def open_material(loaded: "LoadedRun", motion: str = "", checkpoint: str = "last
         others["motion"] = timeline
     description = capture.description
     is_named = description.face_signal == "action_codes" and 0 < len(description.face_names) <= MOST_NAMED_FACE_ENTRIES
-    return Material(
+    return ViewedAvatar(
         avatar=loaded.avatar,
         rig=run.rig,
         timeline=timeline,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsuba_avatar.loaded_run import LoadedRun
-from mitsuba_avatar.view import main, open_material
+from mitsuba_avatar.view import main, open_viewed_avatar
 from tests.drawn_capture import TEST_FRAMES, TRAIN_FRAMES
 
 pytestmark = pytest.mark.usefixtures("one_thread", "private_cache")
@@ -26,26 +26,26 @@ def test_measuring_prints_the_rate_and_its_parts(run, capsys):
     assert float(line.split()[0]) > 0.5
 
 
-def test_material_has_the_capture_s_poses_and_codes(run):
-    material = open_material(LoadedRun.open(run))
-    assert len(material.training) == TRAIN_FRAMES == len(material.latents.mu)
-    assert list(material.others) == ["test"] and len(material.timeline) == TEST_FRAMES
-    assert material.face_names == (), "three landmark coordinates are no actions"
+def test_what_is_viewed_has_the_capture_s_poses_and_codes(run):
+    viewed = open_viewed_avatar(LoadedRun.open(run))
+    assert len(viewed.training) == TRAIN_FRAMES == len(viewed.latents.mu)
+    assert list(viewed.others) == ["test"] and len(viewed.timeline) == TEST_FRAMES
+    assert viewed.face_names == (), "three landmark coordinates are no actions"
 
 
 def test_a_recorded_motion_becomes_the_timeline(run, tmp_path):
     theta = np.linspace(0, 0.4, 15, dtype=np.float32).reshape(3, 5)
     np.save(tmp_path / "walk.npy", theta)
-    material = open_material(LoadedRun.open(run), str(tmp_path / "walk.npy"))
-    np.testing.assert_array_equal(material.timeline.theta, theta)
-    assert list(material.others) == ["test", "motion"] and len(material.timeline.face) == 3
+    viewed = open_viewed_avatar(LoadedRun.open(run), str(tmp_path / "walk.npy"))
+    np.testing.assert_array_equal(viewed.timeline.theta, theta)
+    assert list(viewed.others) == ["test", "motion"] and len(viewed.timeline.face) == 3
 
 
 def test_a_capture_as_motion_brings_its_face(run, drawn_capture, tmp_path):
     shutil.copytree(drawn_capture.path, tmp_path / "other")
     face = np.array(drawn_capture.face) + np.float32(0.01)
     np.save(tmp_path / "other/face.npy", face)
-    timeline = open_material(LoadedRun.open(run), str(tmp_path / "other")).timeline
+    timeline = open_viewed_avatar(LoadedRun.open(run), str(tmp_path / "other")).timeline
     np.testing.assert_array_equal(timeline.face, face[drawn_capture.frame_indices("test")])
 
 
@@ -53,7 +53,7 @@ def test_a_capture_without_meshes_still_has_a_viewer(run, drawn_capture, tmp_pat
     copy = shutil.copytree(drawn_capture.path, tmp_path / "copy", ignore=shutil.ignore_patterns("vertices.npy"))
     facts = (run / "run.json").read_text().replace(str(drawn_capture.path), str(copy))
     (run / "run.json").write_text(facts)
-    assert open_material(LoadedRun.open(run)).latents is None
+    assert open_viewed_avatar(LoadedRun.open(run)).latents is None
     assert "no latent codes of training frames" in capsys.readouterr().err
 
 

@@ -20,12 +20,14 @@ from mitsuba_avatar.analysis.measures import AT_ONCE, MILLIMETRES, Study
 from mitsuba_avatar.analysis.regions import with_surroundings
 from mitsuba_avatar.body.driving import driving_regions
 from mitsuba_avatar.driving.principal_directions import PrincipalDirections
+from mitsuba_avatar.driving.uncertainty import prior_codes, shape_spread, texture_spread
 from mitsuba_avatar.training.statistics import evenly_spaced
 
 FACE = "face"
 DEVIATIONS = 2.0  # of the training frames, that a control is moved by
 FEWEST_VERTICES = 0.02  # share of all vertices that a control must govern to be worth a picture
 FRAMES = 16  # of training, that effects are averaged over
+SAMPLES = 16  # codes of the prior
 
 
 @dataclass(frozen=True)
@@ -91,49 +93,17 @@ def control_effects(study: Study, names: Sequence[str]) -> list[Effect]:
     return effects
 
 
-@torch.no_grad()
-def shape_uncertainty(study: Study, frame: int, samples: int = 16, seed: int = 0) -> Float[np.ndarray, "V"]:  # noqa: F821
-    """Spread of each vertex over codes drawn from the prior, for a frame's driving signal: root mean square distance from the mean, mm.
-
-    Raises:
-        ValueError: if the avatar has no latent code.
-    """
-    row = study.drive.rows(slice(frame, frame + 1))
-    surfaces = []
-    for start in range(0, samples, AT_ONCE):
-        z = prior_codes(study, samples, seed)[start : start + AT_ONCE]
-        surfaces.append(study.avatar.decode_rest_vertices(row.theta.expand(len(z), -1), row.face.expand(len(z), -1), z))
-    return MILLIMETRES * torch.cat(surfaces).double().var(0, correction=1).sum(-1).sqrt().numpy()
+def shape_uncertainty(study: Study, frame: int, samples: int = SAMPLES) -> Float[np.ndarray, "V"]:  # noqa: F821
+    """Spread of each vertex for a frame's driving signal, millimetres (`driving.uncertainty`)."""
+    theta, _, face = study.row(frame)
+    return MILLIMETRES * shape_spread(study.avatar, theta, face, prior_codes(study.avatar, samples)).numpy()
 
 
-@torch.no_grad()
 def texture_uncertainty(
-    study: Study, frame: int, centers: Float[Tensor, "N 3"], occlusion: Tensor | None, samples: int = 16, seed: int = 0
+    study: Study, frame: int, centers: Float[Tensor, "N 3"], occlusion: Tensor | None, samples: int = SAMPLES
 ) -> Float[np.ndarray, "T T"]:
-    """The same of each texel: standard deviation of radiance, root mean square over channels and cameras.
-
-    Args:
-        centers: [N, 3] of the cameras that it is seen from, metres.
-        occlusion: [1, 1, S, S] of the frame; None without the shadow branch.
-    """
-    row = study.drive.rows(slice(frame, frame + 1))
-    textures = [
-        study.avatar.decode(row.theta, row.root, row.face, z[None], centers[None], occlusion).textures[0]
-        for z in prior_codes(study, samples, seed)
-    ]
-    return torch.stack(textures).var(0, correction=1).mean(dim=(0, 1)).sqrt().numpy()
-
-
-def prior_codes(study: Study, samples: int, seed: int) -> Float[Tensor, "M Z"]:
-    """Latent codes drawn from the prior.
-
-    Raises:
-        ValueError: if the avatar has no latent code.
-    """
-    if study.posterior is None:
-        raise ValueError("prior_codes(): expected an avatar with a latent code; model.use_latent is false. Analyse another run.")
-    size = study.avatar.settings.latent_size
-    return torch.randn((samples, size), generator=torch.Generator().manual_seed(seed))
+    """Spread of each texel for a frame's driving signal, seen from cameras at `centers` (`driving.uncertainty`)."""
+    return texture_spread(study.avatar, study.row(frame), centers, occlusion, prior_codes(study.avatar, samples)).numpy()
 
 
 def _decoded(study: Study, theta: Tensor, face: Tensor) -> Float[Tensor, "N V 3"]:

@@ -17,12 +17,12 @@ from mitsuba_avatar.body.driving import driving_regions
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.captures.arrays import open_frame_array
 from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.driving.signals import DrivingSignals
 from mitsuba_avatar.filming.truth import GARMENT, TRUTH_FOLDER
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.model.keypoints import DrivenKeypoints, lists_face_landmarks
 from mitsuba_avatar.reporting.disentanglement import (
-    Drive,
     drive_swap,
     fresh_mutual_information,
     latent_swap,
@@ -109,7 +109,7 @@ class Study:
     avatar: Avatar
     rig: Rig
     capture: Capture
-    drive: Drive
+    drive: DrivingSignals
     posterior: Posterior | None
     exact: np.ndarray
     garment: Int[np.ndarray, "G"] | None
@@ -118,10 +118,9 @@ class Study:
     def of(cls, avatar: Avatar, rig: Rig, capture: Capture) -> "Study":
         """Encode every frame of a capture with a registered mesh."""
         truth, count = capture.path / TRUTH_FOLDER, len(capture.frames)
-        theta, root, face = (torch.from_numpy(np.array(values, np.float32)) for values in (capture.theta, capture.root, capture.face))
         exact = open_frame_array(truth, "vertices", count) if truth.is_dir() else None
         garment = np.load(truth / GARMENT) if (truth / GARMENT).is_file() else None
-        drive = Drive(theta, root, face)
+        drive = DrivingSignals.of_capture(capture)
         return cls(avatar, rig, capture, drive, _encoded(avatar, capture, drive), capture.vertices if exact is None else exact, garment)
 
     def frames(self, *splits: str) -> list[int]:
@@ -139,8 +138,12 @@ class Study:
     @torch.no_grad()
     def surface(self, frame: int, z: Float[Tensor, "1 Z"] | None) -> Float[np.ndarray, "V 3"]:
         """Surface decoded for a frame's driving signal in the world, metres; None is the most likely code."""
-        row = self.drive.rows(slice(frame, frame + 1))
-        return self.avatar.decode_vertices(row.theta, row.root, row.face, z)[0].numpy()
+        return self.avatar.decode_vertices(*self.row(frame), z)[0].numpy()
+
+    def row(self, frame: int) -> tuple[Float[Tensor, "1 D"], Float[Tensor, "1 4 4"], Float[Tensor, "1 F"]]:
+        """Theta, root and face of a frame."""
+        rows = slice(frame, frame + 1)
+        return self.drive.theta[rows], self.drive.root[rows], self.drive.face[rows]
 
     def keypoints(self) -> DrivenKeypoints:
         """What the driving signal fixes."""
@@ -197,11 +200,11 @@ def disentanglement(study: Study, seed: int = 0) -> dict:
     if len(train) >= FEWEST_FRAMES:
         result["mutual_information_nats"] = fresh_mutual_information(posterior, driving[train], seed=seed)
     rows = torch.tensor(judged)
-    drive, z = study.drive.rows(rows), study.posterior.mu[rows]
+    drive, z = study.drive.chosen(judged), study.posterior.mu[rows]
     others = other_frames(driving[rows], seed)
     keypoints, groups = study.keypoints(), study.groups()
     result["latent_swap"] = asdict(latent_swap(study.avatar, keypoints, drive, z, z[others], groups))
-    result["drive_swap"] = asdict(drive_swap(study.avatar, keypoints, drive.rows(others), z, groups))
+    result["drive_swap"] = asdict(drive_swap(study.avatar, keypoints, drive.chosen(others.tolist()), z, groups))
     if study.garment is not None and judged != train:
         hidden = _hidden_state(study, train)
         mu = study.posterior.mu.double().numpy()
@@ -217,8 +220,8 @@ def spurious_effects(study: Study, seed: int = 0) -> dict[str, float]:
         mean distances in millimetres: `face_moves_body_mm`, how far another face moves the surface away from the face,
         and `pose_moves_face_mm`, how far another pose moves the face's landmarks in the head's frame (0 where the face signal lists none).
     """
-    frames = torch.tensor(evenly_spaced(study.frames("train"), 64))
-    drive = study.drive.rows(frames)
+    frames = evenly_spaced(study.frames("train"), 64)
+    drive = study.drive.chosen(frames)
     others = other_frames(study.avatar.standardized_driving(drive.theta, drive.face), seed)
     outside = ~with_surroundings(study.rig, driving_regions(study.rig).face)
     landmarks = torch.from_numpy(study.rig.face_keypoint_vertices)
@@ -243,9 +246,11 @@ def _hidden_state(study: Study, train: list[int]) -> Float[np.ndarray, "N K"]:
     avatar, count = study.avatar, len(study.capture.frames)
     garment = []
     for start in range(0, count, AT_ONCE):
-        part = study.drive.rows(slice(start, start + AT_ONCE))
-        exact = torch.from_numpy(np.array(study.exact[start : start + AT_ONCE], np.float32))
-        garment.append(avatar.unpose(exact, part.theta, part.root)[:, torch.from_numpy(study.garment)].flatten(1).numpy())
+        rows = slice(start, start + AT_ONCE)
+        exact = torch.from_numpy(np.array(study.exact[rows], np.float32))
+        garment.append(
+            avatar.unpose(exact, study.drive.theta[rows], study.drive.root[rows])[:, torch.from_numpy(study.garment)].flatten(1).numpy()
+        )
     shape = np.concatenate(garment).astype(np.float64)
     angles = study.drive.theta.double().numpy()
     moving = angles[train].std(0) > 1e-4
@@ -258,7 +263,7 @@ def _hidden_state(study: Study, train: list[int]) -> Float[np.ndarray, "N K"]:
 
 
 @torch.no_grad()
-def _encoded(avatar: Avatar, capture: Capture, drive: Drive) -> Posterior | None:
+def _encoded(avatar: Avatar, capture: Capture, drive: DrivingSignals) -> Posterior | None:
     """Posterior of every frame of a capture."""
     if not avatar.settings.use_latent or capture.vertices is None:
         return None

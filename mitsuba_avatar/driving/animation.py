@@ -97,7 +97,7 @@ def animate(
         batch = CameraBatch.from_cameras([camera])
         with torch.no_grad():  # left before the yield: the caller's own gradients are not this function's business
             with clock.timed("occlusion"):
-                share = occlusion.bake(posed_template(avatar, theta), seed=row)[None, None].to(device)
+                share = posed_occlusion(avatar, occlusion, theta, seed=row)
             with clock.timed("decoding"):
                 z = decoder_latent(avatar, latents[row : row + 1])
                 output = avatar.decode(theta, root, face, z, batch.centers[None].to(device), share)
@@ -112,6 +112,11 @@ def posed_template(avatar: Avatar, theta: Float[Tensor, "1 D"]) -> Float[Tensor,
     """[V, 3] what ambient occlusion is baked on, in the host's memory: the root pose does not matter to it."""
     root = torch.eye(4, device=theta.device)[None]
     return avatar.pose_template(theta, root)[0].cpu()
+
+
+def posed_occlusion(avatar: Avatar, occlusion: AmbientOcclusion, theta: Float[Tensor, "1 D"], seed: int = 0) -> Float[Tensor, "1 1 S S"]:
+    """Ambient occlusion of one pose as `Avatar.decode` wants it, on the avatar's device."""
+    return occlusion.bake(posed_template(avatar, theta), seed)[None, None].to(avatar.mean_texture.device)
 
 
 @torch.no_grad()

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.captures.colour import encode
-from mitsuba_avatar.driving.animation import decoder_latent, posed_template
+from mitsuba_avatar.driving.animation import decoder_latent, posed_occlusion, posed_template
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
@@ -202,7 +202,7 @@ class Reconstructor:
     def _occlusion(self, theta: Float[Tensor, "1 D"], seed: int) -> Float[Tensor, "1 1 S S"]:
         """Ambient occlusion of the posed template, without gradient."""
         device = self.avatar.mean_texture.device
-        return self.occlusion.bake(posed_template(self.avatar, theta.to(device)), seed)[None, None].to(device)
+        return posed_occlusion(self.avatar, self.occlusion, theta.to(device), seed)
 
 
 def moved_root(root: Float[Tensor, "1 4 4"], motion: Float[Tensor, "1 6"], pivot: Float[Tensor, "3"]) -> Float[Tensor, "1 4 4"]:

@@ -55,7 +55,7 @@ class DrivingSignals:
         return len(self.theta)
 
     def chosen(self, rows: Sequence[int]) -> "DrivingSignals":
-        """Some frames, in rising order; those that do not follow each other come into clips of their own."""
+        """Some frames, in any order and as often as named; those that do not follow each other come into clips of their own."""
         clip_of_row = np.concatenate([np.full(clip.stop - clip.start, order) for order, clip in enumerate(self.clips)])
         runs = consecutive_runs(list(rows), [int(clip_of_row[row]) for row in rows])
         index = torch.tensor(list(rows), dtype=torch.int64)

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mitsuba_avatar.driving.signals import DrivingSignals
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.model.disentanglement import StatisticsNetwork, corrected_objective, mismatched, mutual_information_bound
 from mitsuba_avatar.model.encoder import Posterior
@@ -27,23 +28,6 @@ LEARNING_RATE = 1e-3
 CHECK_EVERY = 25  # steps between looks at the validation frames
 JUDGED_MISMATCHES = 32  # shuffles of the frames that an estimator is judged on
 DECODED_AT_ONCE = 8  # frames
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Driving signals of N frames.
-
-    Attributes:
-        theta: [N, D] radians. root: [N, 4, 4]. face: [N, F].
-    """
-
-    theta: Float[Tensor, "N D"]
-    root: Float[Tensor, "N 4 4"]
-    face: Float[Tensor, "N F"]
-
-    def rows(self, rows: slice | Int[Tensor, "M"]) -> "Drive":
-        """The signals of some frames."""
-        return Drive(self.theta[rows], self.root[rows], self.face[rows])
 
 
 @dataclass(frozen=True)
@@ -151,7 +135,7 @@ def other_frames(driving: Float[Tensor, "N D"], seed: int = 0, farther_than: flo
 def latent_swap(
     avatar: Avatar,
     keypoints: DrivenKeypoints,
-    drive: Drive,
+    drive: DrivingSignals,
     z: Float[Tensor, "N Z"],
     other_z: Float[Tensor, "N Z"],
     vertex_groups: Mapping[str, Bool[np.ndarray, "V"]] | None = None,
@@ -170,7 +154,7 @@ def latent_swap(
     distances = []
     with torch.no_grad():
         for rows in _portions(len(z)):
-            part = drive.rows(rows)
+            part = drive.chosen(range(*rows.indices(len(z))))
             both = [avatar.decode_rest_vertices(part.theta, part.face, codes[rows]) for codes in (z, other_z)]
             shown = [keypoints.from_surface(rest, part.theta, part.root) for rest in both]
             # A pose turns both surfaces alike but for blended joints: distances in rest space are those in the world.
@@ -181,7 +165,7 @@ def latent_swap(
 def drive_swap(
     avatar: Avatar,
     keypoints: DrivenKeypoints,
-    other_drive: Drive,
+    other_drive: DrivingSignals,
     z: Float[Tensor, "N Z"],
     vertex_groups: Mapping[str, Bool[np.ndarray, "V"]] | None = None,
 ) -> SwapDistances:
@@ -200,7 +184,7 @@ def drive_swap(
     distances = []
     with torch.no_grad():
         for rows in _portions(len(z)):
-            part = other_drive.rows(rows)
+            part = other_drive.chosen(range(*rows.indices(len(z))))
             rest = avatar.decode_rest_vertices(part.theta, part.face, z[rows])
             neutral = avatar.decode_rest_vertices(part.theta, part.face, None)
             asked = keypoints.from_driving(part.theta, part.root, part.face)

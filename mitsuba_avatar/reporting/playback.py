@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.driving.animation import posed_occlusion
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
 
@@ -60,8 +61,7 @@ class Playback:
         )
         if turn is not None:
             root = torch.from_numpy(turn.astype(np.float32)).to(device)[None] @ root
-        template = self.avatar.pose_template(theta, torch.eye(4, device=device)[None])[0]
-        share = self.occlusion.bake(template.cpu(), seed=frame)
+        share = posed_occlusion(self.avatar, self.occlusion, theta, seed=frame)
         cameras = torch.as_tensor(centers, dtype=torch.float32, device=device)[None]
-        output = self.avatar.decode(theta, root, face, None, cameras, share[None, None].to(device))
-        return PosedAvatar(output.rest_vertices[0].cpu(), output.vertices[0].cpu(), output.textures[0].cpu(), share.cpu())
+        output = self.avatar.decode(theta, root, face, None, cameras, share)
+        return PosedAvatar(output.rest_vertices[0].cpu(), output.vertices[0].cpu(), output.textures[0].cpu(), share[0, 0].cpu())

@@ -102,8 +102,8 @@ class BrowserViewer:
         """Move the timeline on while it plays."""
         if self._is_playing:
             started, first = self._played_from
-            fps = self.session.material.timeline.fps
-            frame = (first + int((time.monotonic() - started) * fps)) % len(self.session.material.timeline)
+            fps = self.session.viewed.timeline.fps
+            frame = (first + int((time.monotonic() - started) * fps)) % len(self.session.viewed.timeline)
             if frame != self.session.state.frame:
                 self.session.set_frame(frame)
 
@@ -155,7 +155,7 @@ class BrowserViewer:
             box = gui.add_checkbox(label, getattr(session.state, name), hint=hint)
             box.on_update(lambda event, name=name: session.change(lambda state: replace(state, **{name: event.target.value})))
         with gui.add_folder("Timeline"):
-            last = len(session.material.timeline) - 1
+            last = len(session.viewed.timeline) - 1
             self._frame = gui.add_slider("frame", 0, max(last, 1), 1, 0, disabled=last == 0)
             self._frame.on_update(self._by_user(lambda event: session.set_frame(int(event.target.value))))
             play = gui.add_checkbox("play", False, disabled=last == 0)
@@ -163,7 +163,7 @@ class BrowserViewer:
 
     def _add_pose_controls(self) -> None:
         gui, session = self.server.gui, self.session
-        names = session.material.rig.dofs.names
+        names = session.viewed.rig.dofs.names
         back = gui.add_button("pose of the timeline")
         back.on_click(lambda event: (session.set_frame(session.state.frame), self._show_state()))
         for limb, indices in session.limbs.items():
@@ -178,7 +178,7 @@ class BrowserViewer:
 
     def _add_face_controls(self) -> None:
         gui, session = self.server.gui, self.session
-        for index, name in enumerate(session.material.face_names):
+        for index, name in enumerate(session.viewed.face_names):
             slider = gui.add_slider(name, 0.0, 1.0, 0.01, float(np.clip(session.state.face[index], 0, 1)))
             slider.on_update(
                 self._by_user(

@@ -18,6 +18,8 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.uv import UvAtlas
 from mitsuba_avatar.captures.cameras import Camera
 from mitsuba_avatar.captures.colour import decode, encode
+from mitsuba_avatar.driving.animation import posed_occlusion
+from mitsuba_avatar.driving.uncertainty import prior_codes, shape_spread
 from mitsuba_avatar.model.avatar import Avatar, AvatarOutput
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
@@ -134,8 +136,7 @@ class Painter:
         key = np.asarray(state.theta, np.float32).tobytes()
         self._lag += 1
         if self._share is None or (key != self._share[0] and self._lag > quality.occlusion_lag):
-            template = self.avatar.pose_template(theta, torch.eye(4, device=theta.device)[None])[0]
-            self._share, self._lag = (key, self.occlusion.bake(template.cpu())[None, None].to(theta.device)), 0
+            self._share, self._lag = (key, posed_occlusion(self.avatar, self.occlusion, theta)), 0
         return self._share[1]
 
     def _surface(
@@ -170,17 +171,13 @@ class Painter:
         return (0.15 + 0.7 * (to_camera * normals).sum(1, keepdim=True).clamp(min=0)).expand(-1, 3, -1, -1)
 
     def _spread_colours(self, state: ViewState, theta: Tensor, face: Tensor) -> Float[Tensor, "1 3 S S"]:
-        """Distance of the surface from its mean over latent codes drawn from the prior, root mean square, as a heat map."""
-        settings = self.avatar.settings
+        """Spread of the surface over latent codes drawn from the prior, as a heat map; none for an avatar without a latent code."""
         key = np.concatenate([state.theta, face[0].cpu().numpy()]).tobytes()
         if self._spread is None or self._spread[0] != key:
-            count = UNCERTAINTY_SAMPLES if settings.use_latent else 1
-            z = None
-            if settings.use_latent:
-                z = torch.randn(count, settings.latent_size, generator=torch.Generator().manual_seed(0)).to(theta.device)
-            rest = self.avatar.decode_rest_vertices(theta.expand(count, -1), face.expand(count, -1), z)
-            deviation = (rest - rest.mean(0)).square().sum(-1).mean(0).sqrt()  # [V] metres
-            self._spread = (key, self.atlas.texels_from_vertices(deviation.cpu()[None, :, None]))
+            spread = torch.zeros(self.rig.topology.num_vertices)
+            if self.avatar.settings.use_latent:
+                spread = shape_spread(self.avatar, theta, face, prior_codes(self.avatar, UNCERTAINTY_SAMPLES)).cpu()
+            self._spread = (key, self.atlas.texels_from_vertices(spread[None, :, None]))
         colours = heat_map(1000 * self._spread[1][0, 0].numpy(), UNCERTAINTY_MAXIMUM_MM)
         return torch.from_numpy(colours).permute(2, 0, 1)[None]
 

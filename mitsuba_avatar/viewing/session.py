@@ -45,7 +45,7 @@ _LEGENDS = {
 
 
 @dataclass(frozen=True, eq=False)  # tensors have no truth value to compare by
-class Material:
+class ViewedAvatar:
     """What a session has to show.
 
     Attributes:
@@ -79,26 +79,26 @@ class ViewerSession:
         version: grows with every change of the state.
     """
 
-    def __init__(self, material: Material):
-        self.material, self.painter = material, Painter(material.avatar, material.rig, material.occlusion)
-        self.limbs = limb_groups(material.rig.dofs.names)
-        recorded = torch.cat([material.training.theta, material.timeline.theta]).numpy()
+    def __init__(self, viewed: ViewedAvatar):
+        self.viewed, self.painter = viewed, Painter(viewed.avatar, viewed.rig, viewed.occlusion)
+        self.limbs = limb_groups(viewed.rig.dofs.names)
+        recorded = torch.cat([viewed.training.theta, viewed.timeline.theta]).numpy()
         self.angle_limits: Float[np.ndarray, "D 2"] = np.stack(
-            [np.minimum(material.rig.dofs.lower, recorded.min(axis=0)), np.maximum(material.rig.dofs.upper, recorded.max(axis=0))], axis=1
+            [np.minimum(viewed.rig.dofs.lower, recorded.min(axis=0)), np.maximum(viewed.rig.dofs.upper, recorded.max(axis=0))], axis=1
         )
-        self.face_directions = PrincipalDirections.of(material.training.face.numpy(), FACE_DIRECTIONS)
-        has_codes = material.latents is not None and material.latents.mu.shape[1] > 0
-        self.latent_directions = PrincipalDirections.of(material.latents.mu.numpy(), LATENT_DIRECTIONS) if has_codes else None
+        self.face_directions = PrincipalDirections.of(viewed.training.face.numpy(), FACE_DIRECTIONS)
+        has_codes = viewed.latents is not None and viewed.latents.mu.shape[1] > 0
+        self.latent_directions = PrincipalDirections.of(viewed.latents.mu.numpy(), LATENT_DIRECTIONS) if has_codes else None
         self.imputations = ("zero",)
-        if material.avatar.settings.use_latent:
+        if viewed.avatar.settings.use_latent:
             self.imputations = ("zero", "prior", "clip", *(FROM_TRAINING if has_codes else ()))
-        self.groups = {"training": material.training, **material.others}
+        self.groups = {"training": viewed.training, **viewed.others}
         self.pose_map = PoseMap({name: signals.theta.numpy() for name, signals in self.groups.items()}) if len(recorded) > 3 else None
         self._imputed: dict[str, Tensor] = {}
         self._lock, self.version = threading.Lock(), 0
         shifts = len(self.face_directions.steps), 0 if self.latent_directions is None else len(self.latent_directions.steps)
         self.state = replace(
-            self._taken(material.timeline, 0, 0),
+            self._taken(viewed.timeline, 0, 0),
             face_shift=(0.0,) * shifts[0],
             latent_shift=(0.0,) * shifts[1],
         )
@@ -111,8 +111,8 @@ class ViewerSession:
 
     def set_frame(self, frame: int) -> None:
         """Take pose, root and face of a row of the timeline; rows beyond its end begin anew. Shifts and switches stay."""
-        frame %= len(self.material.timeline)
-        taken = self._taken(self.material.timeline, frame, frame)
+        frame %= len(self.viewed.timeline)
+        taken = self._taken(self.viewed.timeline, frame, frame)
         self.change(lambda state: replace(state, theta=taken.theta, root=taken.root, face=taken.face, frame=frame))
 
     def load_pose(self, group: str, row: int) -> None:
@@ -140,14 +140,14 @@ class ViewerSession:
     def face_signal(self, state: ViewState) -> Float[np.ndarray, "F"]:  # noqa: F821
         """[F] of a state, shifts added; facial actions stay in 0..1."""
         face = state.face + self.face_directions.offset(np.array(state.face_shift))
-        return np.clip(face, 0, 1) if self.material.face_names else face
+        return np.clip(face, 0, 1) if self.viewed.face_names else face
 
     def latent(self, state: ViewState) -> Float[Tensor, "1 Z"] | None:
         """Latent code of a state: imputed, shifts added; None for an avatar that has none.
 
         `nearest` looks at the state's own pose and face; the others were imputed along the timeline and are read at the state's frame.
         """
-        settings = self.material.avatar.settings
+        settings = self.viewed.avatar.settings
         if not settings.use_latent:
             return None
         if state.imputation == "nearest":
@@ -155,22 +155,22 @@ class ViewerSession:
                 torch.from_numpy(state.theta)[None].float(),
                 torch.from_numpy(state.root)[None].float(),
                 torch.from_numpy(self.face_signal(state))[None].float(),
-                self.material.timeline.fps,
+                self.viewed.timeline.fps,
             )
             z = self._imputation("nearest").latents(drive)
         else:
             if state.imputation not in self._imputed:
-                self._imputed[state.imputation] = self._imputation(state.imputation).latents(self.material.timeline)
+                self._imputed[state.imputation] = self._imputation(state.imputation).latents(self.viewed.timeline)
             z = self._imputed[state.imputation][state.frame][None]
         if self.latent_directions is not None:
             z = z + torch.from_numpy(self.latent_directions.offset(np.array(state.latent_shift)))[None]
-        return z.float().to(self.material.avatar.mean_texture.device)
+        return z.float().to(self.viewed.avatar.mean_texture.device)
 
     def picture(self, camera: Camera, quality: Quality = STILL) -> UInt8[np.ndarray, "H W 3"]:
         """What the state looks like from a camera, with map and legend."""
         with self._lock:
             state = self.state
-        shown = replace(state, root=self.material.timeline.root[0].numpy()) if state.is_in_place else state
+        shown = replace(state, root=self.viewed.timeline.root[0].numpy()) if state.is_in_place else state
         image = self.painter.draw(shown, self.face_signal(state), self.latent(state), camera, quality)
         legend = _LEGENDS.get(state.surface)
         if legend:
@@ -185,8 +185,8 @@ class ViewerSession:
         state = self.state
         with torch.no_grad():
             rows = (torch.from_numpy(np.asarray(values, np.float32))[None] for values in (state.theta, state.root))
-            device = self.material.avatar.mean_texture.device
-            points = self.material.avatar.pose_template(*(row.to(device) for row in rows))[0].cpu().numpy().astype(np.float64)
+            device = self.viewed.avatar.mean_texture.device
+            points = self.viewed.avatar.pose_template(*(row.to(device) for row in rows))[0].cpu().numpy().astype(np.float64)
         target = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius = float(np.linalg.norm(points - target, axis=1).max())
         front = np.asarray(state.root, np.float64)[:3, :3] @ np.array([0.0, -1.0, 0.12])
@@ -220,8 +220,8 @@ class ViewerSession:
         return {"frames_per_second": rate} | {f"{part}_ms": 1000 * value / frames for part, value in sums.items()}
 
     def _imputation(self, name: str):
-        settings = self.material.avatar.settings
-        return make_imputation(name, settings.latent_size if settings.use_latent else 0, self.material.latents)
+        settings = self.viewed.avatar.settings
+        return make_imputation(name, settings.latent_size if settings.use_latent else 0, self.viewed.latents)
 
     def _taken(self, signals: DrivingSignals, row: int, frame: int) -> ViewState:
         return ViewState(signals.theta[row].numpy().copy(), signals.root[row].numpy().copy(), signals.face[row].numpy().copy(), frame)

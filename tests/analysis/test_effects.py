@@ -1,5 +1,6 @@
 """Effects of controls and spreads of codes, on decoders that are told what to move."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,10 +65,11 @@ def test_spreads_are_those_of_the_decoder(study: Study, monkeypatch: pytest.Monk
     assert spread == pytest.approx(10 * np.sqrt(3), rel=0.1)
 
 
-def test_texture_spread_is_a_map_and_asks_for_a_latent_code(study: Study):
+def test_texture_spread_is_a_map_and_asks_for_a_latent_code(study: Study, monkeypatch: pytest.MonkeyPatch):
     centers = torch.tensor([[1.0, -2.0, 1.0], [0.5, 2.0, 1.5]])
     size, open_everywhere = study.avatar.settings.texture_size, torch.ones(1, 1, *2 * [study.avatar.settings.shadow_size])
     spread = texture_uncertainty(study, 9, centers, open_everywhere, samples=3)
     assert spread.shape == (size, size) and (spread >= 0).all() and spread.max() > 0
     with pytest.raises(ValueError, match="use_latent is false"):
-        shape_uncertainty(Study(study.avatar, study.rig, study.capture, study.drive, None, study.exact, None), 9)
+        monkeypatch.setattr(study.avatar, "settings", replace(study.avatar.settings, use_latent=False))
+        shape_uncertainty(study, 9)

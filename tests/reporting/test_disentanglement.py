@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from mitsuba_avatar.body.driving import face_keypoints
+from mitsuba_avatar.driving.signals import DrivingSignals
 from mitsuba_avatar.model.avatar import Avatar, DrivingStatistics
 from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.model.keypoints import DrivenKeypoints
 from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.reporting.disentanglement import (
-    Drive,
     drive_swap,
     fresh_mutual_information,
     latent_swap,
@@ -56,7 +56,7 @@ def drive(avatar):
     """Poses at random; the face signal lists the template's landmarks."""
     generator = torch.Generator().manual_seed(0)
     face = face_keypoints(make_small_rig(), avatar.template_vertices[None]).expand(FRAMES, -1)
-    return Drive(0.5 * torch.randn((FRAMES, 5), generator=generator), torch.eye(4).repeat(FRAMES, 1, 1), face)
+    return DrivingSignals(0.5 * torch.randn((FRAMES, 5), generator=generator), torch.eye(4).repeat(FRAMES, 1, 1), face, fps=10.0)
 
 
 def codes(first: float, second: float) -> torch.Tensor:

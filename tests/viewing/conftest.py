@@ -5,18 +5,18 @@ import shutil
 import pytest
 
 from mitsuba_avatar.loaded_run import LoadedRun
-from mitsuba_avatar.view import open_material
+from mitsuba_avatar.view import open_viewed_avatar
 
 
 @pytest.fixture(scope="session")
-def material(fitted_run, tmp_path_factory):
+def viewed(fitted_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewed") / "run"
     shutil.copytree(fitted_run, folder)
-    return open_material(LoadedRun.open(folder))
+    return open_viewed_avatar(LoadedRun.open(folder))
 
 
 @pytest.fixture
-def session(material, private_cache, one_thread):
+def session(viewed, private_cache, one_thread):
     from mitsuba_avatar.viewing.session import ViewerSession
 
-    return ViewerSession(material)
+    return ViewerSession(viewed)

@@ -84,7 +84,7 @@ def test_a_window_that_has_not_said_where_it_looks_from_waits(viewer, monkeypatc
 
 def test_sliders_change_the_session_and_follow_it(viewer):
     session = viewer.session
-    elbow = session.material.rig.dofs.names.index("elbow_flexion")
+    elbow = session.viewed.rig.dofs.names.index("elbow_flexion")
     changed_by_user(viewer._angles[elbow], 45.0)
     assert session.state.theta[elbow] == pytest.approx(np.radians(45))
     kind, index, slider = next(entry for entry in viewer._shifts if entry[0] == "latent_shift")
@@ -101,7 +101,7 @@ def test_sliders_change_the_session_and_follow_it(viewer):
 def test_playing_moves_the_timeline(viewer, monkeypatch):
     viewer._play(True)
     now = time.monotonic()
-    monkeypatch.setattr(browser.time, "monotonic", lambda: now + 1.05 / viewer.session.material.timeline.fps)
+    monkeypatch.setattr(browser.time, "monotonic", lambda: now + 1.05 / viewer.session.viewed.timeline.fps)
     viewer._advance()
     assert viewer.session.state.frame == 1
     viewer._play(False)

@@ -60,7 +60,7 @@ def test_switches_change_the_picture(session):
 
 
 def test_the_timeline_runs_along_the_test_split_and_begins_anew(session, drawn_capture):
-    assert len(session.material.timeline) == TEST_FRAMES
+    assert len(session.viewed.timeline) == TEST_FRAMES
     session.set_frame(TEST_FRAMES + 1)
     assert session.state.frame == 1
     np.testing.assert_array_equal(session.state.theta, drawn_capture.theta[TRAIN_FRAMES + 1])
@@ -71,7 +71,7 @@ def test_in_place_keeps_the_first_root(session):
     session.set_frame(1)
     moved = picture(session)
     assert difference(moved, picture(session, is_in_place=True)) > 0.01
-    session.change(lambda state: replace(state, root=session.material.timeline.root[0].numpy(), is_in_place=False))
+    session.change(lambda state: replace(state, root=session.viewed.timeline.root[0].numpy(), is_in_place=False))
     still = session.picture(camera(session))
     session.change(lambda state: replace(state, is_in_place=True))
     np.testing.assert_array_equal(session.picture(camera(session)), still)
@@ -79,7 +79,7 @@ def test_in_place_keeps_the_first_root(session):
 
 def test_an_angle_turns_its_joint_and_counts_as_a_change(session):
     before, version = picture(session), session.version
-    elbow = session.material.rig.dofs.names.index("elbow_flexion")
+    elbow = session.viewed.rig.dofs.names.index("elbow_flexion")
     low, high = session.angle_limits[elbow]
     session.change(lambda state: state.with_angle(elbow, float(high)))
     assert session.version == version + 1 and low <= 0 < high
@@ -88,7 +88,7 @@ def test_an_angle_turns_its_joint_and_counts_as_a_change(session):
 
 
 def test_limits_hold_every_recorded_pose(session):
-    for signals in (session.material.training, session.material.timeline):
+    for signals in (session.viewed.training, session.viewed.timeline):
         theta = signals.theta.numpy()
         assert (theta >= session.angle_limits[:, 0]).all() and (theta <= session.angle_limits[:, 1]).all()
 
@@ -110,11 +110,11 @@ def test_every_imputation_gives_a_code_of_its_own(session):
     for name in session.imputations:
         session.change(lambda state, name=name: replace(state, imputation=name))
         codes[name] = session.latent(session.state)
-        assert codes[name].shape == (1, session.material.avatar.settings.latent_size)
+        assert codes[name].shape == (1, session.viewed.avatar.settings.latent_size)
         torch.testing.assert_close(session.latent(session.state), codes[name], msg="the same at every look")
     assert {"zero", "mean", "prior", "clip", "nearest", "temporal"} <= set(codes)
     assert not codes["zero"].any() and all(codes[name].any() for name in ("mean", "prior", "nearest"))
-    torch.testing.assert_close(codes["mean"][0], session.material.latents.mu.mean(0))
+    torch.testing.assert_close(codes["mean"][0], session.viewed.latents.mu.mean(0))
 
 
 def test_nearest_follows_the_pose_that_is_shown(session):
@@ -122,7 +122,7 @@ def test_nearest_follows_the_pose_that_is_shown(session):
     session.change(lambda state: replace(state, imputation="nearest"))
     for row in (0, 5):
         session.load_pose("training", row)
-        torch.testing.assert_close(session.latent(session.state)[0], session.material.latents.mu[row])
+        torch.testing.assert_close(session.latent(session.state)[0], session.viewed.latents.mu[row])
 
 
 def test_a_click_on_the_map_loads_the_pose_under_it(session, drawn_capture):
@@ -157,31 +157,31 @@ def test_a_moving_picture_is_coarser_but_the_same(session):
 def test_occlusion_lags_while_moving_and_is_right_when_still(session):
     session.change(lambda state: replace(state, has_map=False, surface="ambient occlusion"))
     session.picture(camera(session))
-    elbow = session.material.rig.dofs.names.index("elbow_flexion")
+    elbow = session.viewed.rig.dofs.names.index("elbow_flexion")
     session.change(lambda state: state.with_angle(elbow, 2.0))
     session.picture(camera(session), MOVING)
     stale = session.painter._share[0]
     session.picture(camera(session))
-    assert session.painter._share[0] != stale == np.asarray(session.material.timeline.theta[0]).tobytes()
+    assert session.painter._share[0] != stale == np.asarray(session.viewed.timeline.theta[0]).tobytes()
 
 
-def test_an_avatar_without_codes_of_training_frames_offers_what_needs_none(material, one_thread):
-    bare = ViewerSession(replace(material, latents=None))
+def test_an_avatar_without_codes_of_training_frames_offers_what_needs_none(viewed, one_thread):
+    bare = ViewerSession(replace(viewed, latents=None))
     assert bare.imputations == ("zero", "prior", "clip") and bare.latent_directions is None and bare.state.latent_shift == ()
     assert picture(bare).std() > 1
 
 
-def test_named_facial_actions_stay_between_zero_and_one(material):
-    session = ViewerSession(replace(material, face_names=("open", "blink", "frown")))
+def test_named_facial_actions_stay_between_zero_and_one(viewed):
+    session = ViewerSession(replace(viewed, face_names=("open", "blink", "frown")))
     session.change(lambda state: state.with_face_entry(1, 0.75).with_face_shift(0, 3.0))
     signal = session.face_signal(session.state)
     assert signal.min() >= 0 and signal.max() <= 1 and session.state.face[1] == 0.75
 
 
-def test_one_frame_is_a_timeline_too(material):
-    timeline = material.timeline.chosen([0])
+def test_one_frame_is_a_timeline_too(viewed):
+    timeline = viewed.timeline.chosen([0])
     assert isinstance(timeline, DrivingSignals)
-    session = ViewerSession(replace(material, timeline=timeline))
+    session = ViewerSession(replace(viewed, timeline=timeline))
     session.set_frame(5)
     assert session.state.frame == 0
 
