@@ -27,6 +27,7 @@ class EvaluateCommand:
     out: str = ""  # where metrics go; default: RUN/metrics.json; the pictures' CSV lies beside it
     protocols: tuple[Literal["mask", "image", "box"], ...] = ("mask", "image", "box")  # regions that image errors are averaged over
     flip: bool = True  # measure FLIP, which takes longer than everything else
+    lpips: str = ""  # measure LPIPS too, with the weights of this file (docs/reports.md)
     flicker_frames: int = 4  # frames per split whose flicker is measured; 0 for none
     variant: str = "auto"  # Mitsuba variant
 
@@ -55,14 +56,16 @@ def _evaluate(command: EvaluateCommand) -> int:
     from mitsuba_avatar.loaded_run import LoadedRun
     from mitsuba_avatar.progress import progress_bar
     from mitsuba_avatar.reporting.evaluation import Measures
+    from mitsuba_avatar.reporting.lpips import Lpips
     from mitsuba_avatar.reporting.tables import terminal_table
 
+    network = Lpips.load(command.lpips) if command.lpips else None
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
     output = Path(command.out) if command.out else loaded.run.metrics_path
     check_writable(output.parent)
     evaluator = loaded.evaluator()
     frames = evaluator.split_frames(command.frames or loaded.run.settings.evaluation.frames_per_split)
-    measures = Measures(command.protocols, has_flip=command.flip, has_seams=True)
+    measures = Measures(command.protocols, has_flip=command.flip, has_seams=True, lpips=network)
     with progress_bar("evaluating", sum(map(len, frames.values()))) as bar:
         metrics = evaluator.measure(frames, progress=bar.update, measures=measures)
     if command.flicker_frames:

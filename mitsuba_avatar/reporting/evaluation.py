@@ -18,6 +18,7 @@ from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
+from mitsuba_avatar.reporting.lpips import Lpips
 from mitsuba_avatar.reporting.metrics import MetricsAccumulator, silhouette_iou, temporal_flicker, vertex_error_mm
 from mitsuba_avatar.reporting.protocols import PROTOCOLS, Protocol, protocol_metrics
 from mitsuba_avatar.reporting.seams import SeamSampler
@@ -52,11 +53,13 @@ class Measures:
         protocols: regions that image errors are averaged over.
         has_flip: FLIP too; it takes longer than all the others together.
         has_seams: the difference across the texture's seams too.
+        lpips: LPIPS with these weights too.
     """
 
     protocols: tuple[Protocol, ...] = ("mask",)
     has_flip: bool = False
     has_seams: bool = False
+    lpips: Lpips | None = None
 
 
 EVERY_MEASURE = Measures(PROTOCOLS, has_flip=True, has_seams=True)
@@ -127,7 +130,9 @@ class Evaluator:
                     for view, name in enumerate(names):
                         if not masks[view].any():
                             continue  # the person is outside this camera's image
-                        values = protocol_metrics(images[view], references[view], masks[view], measures.protocols, measures.has_flip)
+                        values = protocol_metrics(
+                            images[view], references[view], masks[view], measures.protocols, measures.has_flip, measures.lpips
+                        )
                         values["iou"] = silhouette_iou(silhouettes[view], masks[view])
                         result.add(method, split, "held_out" if name in held_out else "seen", values | of_frame, (name, number))
                 done += 1

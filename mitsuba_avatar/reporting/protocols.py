@@ -20,6 +20,7 @@ import flip_evaluator
 import numpy as np
 from jaxtyping import Float
 
+from mitsuba_avatar.reporting.lpips import Lpips
 from mitsuba_avatar.reporting.metrics import difference_maps, mean_over, psnr_from_mse, ssim_map
 
 Protocol = Literal["mask", "image", "box"]
@@ -77,8 +78,11 @@ def protocol_metrics(
     mask: Float[np.ndarray, "H W"],
     protocols: Sequence[Protocol] = PROTOCOLS,
     has_flip: bool = True,
+    lpips: Lpips | None = None,
 ) -> dict[str, float]:
-    """PSNR (dB), SSIM, L1 and MSE (0..255 values), and FLIP if asked, of one picture by each protocol.
+    """PSNR (dB), SSIM, L1 and MSE (0..255 values), FLIP if asked and LPIPS if given, of one picture by each protocol.
+
+    LPIPS of the protocol `image` is the published distance; of the others it is the mean of its map.
 
     Returns:
         metric name -> value; see `metric_name`.
@@ -90,11 +94,15 @@ def protocol_metrics(
     maps = {"ssim": ssim_map(image, reference), "l1": absolute, "mse": squared}
     if has_flip:
         maps["flip"] = flip_map(image, reference)
+    if lpips is not None:
+        distance, maps["lpips"] = lpips.compare(image, reference)
     values: dict[str, float] = {}
     for protocol in protocols:
         weights = region(mask, protocol)
         means = {name: mean_over(errors, weights, "protocol_metrics") for name, errors in maps.items()}
         means = {"psnr": psnr_from_mse(means["mse"])} | means
+        if lpips is not None and protocol == "image":
+            means["lpips"] = distance
         values |= {metric_name(name, protocol): value for name, value in means.items()}
     return values
 
@@ -109,4 +117,4 @@ def protocol_of(metric: str) -> Protocol | None:
     for protocol in ("image", "box"):
         if metric.startswith(f"{protocol}_"):
             return protocol
-    return "mask" if metric in ("psnr", "ssim", "l1", "mse", "flip") else None
+    return "mask" if metric in ("psnr", "ssim", "l1", "mse", "flip", "lpips") else None

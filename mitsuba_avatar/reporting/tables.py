@@ -29,6 +29,7 @@ _COLUMNS = {
     "l1": _Column("L1", "0..255", 2, -1),
     "mse": _Column("MSE", "0..255", 1, -1),
     "flip": _Column("FLIP", "", 4, -1),
+    "lpips": _Column("LPIPS", "", 4, -1),
     "iou": _Column("IoU", "", 4, 1),
     "silhouette_iou": _Column("IoU", "", 4, 1),
     "vertex_mm": _Column("vertices", "mm", 2, -1),

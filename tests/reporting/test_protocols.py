@@ -1,4 +1,4 @@
-"""The three protocols against scikit-image, FLIP against its authors' tool, and each mean over the region that it names."""
+"""The three protocols against scikit-image, FLIP against its equations, and each mean over the region that it names."""
 
 import flip_evaluator
 import numpy as np
@@ -69,6 +69,29 @@ def test_flip_is_zero_for_equal_pictures_symmetric_in_place_and_at_most_one(pair
     assert errors[20:, :10].max() < 1e-6 < errors[5, 29], "what is far away is not touched, what is near is"
 
 
+@pytest.mark.parametrize(
+    ("colour", "other"),
+    [
+        ((0.2, 0.5, 0.7), (0.25, 0.45, 0.7)),
+        ((0.9, 0.1, 0.3), (0.1, 0.6, 0.3)),
+        ((0, 1, 0), (0, 0, 1)),
+        ((0.5, 0.5, 0.5), (0.52, 0.52, 0.52)),
+    ],
+)
+def test_flip_of_plain_pictures_is_that_of_its_equations(colour, other):
+    """No filter changes a plain picture and it has no edges: what is left is the colour difference, on both branches of its remapping."""
+    image, reference = (np.broadcast_to(np.float32(values), (23, 36, 3)).copy() for values in (colour, other))
+    assert flip_map(image, reference) == pytest.approx(plain_flip(colour, other), abs=2e-3)
+
+
+def test_flip_forgives_what_is_too_small_to_see():
+    """Stripes a pixel wide: the farther away, the greyer."""
+    stripes = np.broadcast_to((np.arange(80) % 2)[None, :, None], (50, 80, 3)).astype(np.float32)
+    grey = np.full_like(stripes, 0.735)  # half of the stripes' radiance, display-encoded
+    near, far = (float(flip_map(stripes, grey, pixels_per_degree)[15:35, 20:60].mean()) for pixels_per_degree in (15.0, 120.0))
+    assert far < 0.5 * near
+
+
 def test_names_tell_the_protocol(pair):
     values = protocol_metrics(*pair)
     assert len(values) == 15 and list(values)[:5] == ["psnr", "ssim", "l1", "mse", "flip"]
@@ -122,3 +145,24 @@ def reference_similarity(image: np.ndarray, reference: np.ndarray) -> np.ndarray
 def flip_of(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     errors, _, _ = flip_evaluator.evaluate(reference, image, "LDR", applyMagma=False)
     return errors[..., 0]
+
+
+def plain_flip(colour: tuple[float, float, float], other: tuple[float, float, float]) -> float:
+    """FLIP of two plain pictures in float64: Andersson et al. 2020, section 4.1 (Hunt-adjusted CIELAB, HyAB distance, remapping)."""
+
+    def adjusted(values: tuple[float, float, float]) -> np.ndarray:
+        encoded = np.array(values, np.float64)
+        linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+        matrix = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]])
+        ratio = matrix @ linear / matrix.sum(axis=1)
+        root = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
+        lightness = 116 * root[1] - 16
+        return np.array([lightness, 0.01 * lightness * 500 * (root[0] - root[1]), 0.01 * lightness * 200 * (root[1] - root[2])])
+
+    def distance(first: tuple[float, float, float], second: tuple[float, float, float]) -> float:
+        change = adjusted(first) - adjusted(second)
+        return (abs(change[0]) + np.hypot(change[1], change[2])) ** 0.7
+
+    largest = distance((0, 1, 0), (0, 0, 1))
+    share = distance(colour, other) / largest
+    return 0.95 * share / 0.4 if share < 0.4 else 0.95 + 0.05 * (share - 0.4) / 0.6
