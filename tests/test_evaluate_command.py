@@ -5,10 +5,12 @@ import shutil
 
 import numpy as np
 import pytest
+from safetensors.torch import save_file
 
 from mitsuba_avatar.evaluate import main
 from mitsuba_avatar.reporting.evaluation import METHODS
 from mitsuba_avatar.reporting.metrics import load_metrics, load_pictures
+from tests.reporting.test_lpips import random_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -80,3 +82,15 @@ def test_another_face_signal_is_refused(fitted_run, drawn_capture, private_cache
     np.save(tmp_path / "copy/face.npy", np.zeros((len(drawn_capture.frames), 5), np.float32))
     assert main([str(fitted_run), "--capture", str(tmp_path / "copy"), "--out", str(tmp_path / "metrics.json")]) == 2
     assert "expected a face signal of 3 numbers" in capsys.readouterr().err and not (tmp_path / "metrics.json").exists()
+
+
+def test_lpips_is_measured_with_the_weights_of_a_file(fitted_run, private_cache, tmp_path, capsys):
+    weights, out = tmp_path / "alex.safetensors", tmp_path / "metrics.json"
+    words = [str(fitted_run), "--frames", "1", "--flicker-frames", "0", "--no-flip", "--out", str(out), "--lpips", str(weights)]
+    assert main(words) == 2
+    assert f"expected a file of weights at {weights}; got none" in capsys.readouterr().err
+    save_file(random_weights(), weights)
+    assert main(words) == 0 and "LPIPS ↓" in capsys.readouterr().out
+    means = load_metrics(out)
+    for name in ("lpips", "image_lpips", "box_lpips"):
+        assert 0 < means["avatar"]["train"]["seen"][name] < 1

@@ -12,8 +12,7 @@ from mitsuba_avatar.reporting.protocols import protocol_metrics
 PUBLISHED_DISTANCE, PUBLISHED_MAP_MEAN, PUBLISHED_MAP_CORNER = 0.0024173781, 0.0024177197, 0.0028804636
 
 
-@pytest.fixture(scope="module")
-def weights() -> dict[str, torch.Tensor]:
+def random_weights() -> dict[str, torch.Tensor]:
     """Random features, heads that are nowhere negative as the published ones are."""
     random = np.random.default_rng(8)
     result = {}
@@ -23,6 +22,11 @@ def weights() -> dict[str, torch.Tensor]:
         result[f"features.{number}.bias"] = 0.1 * random.standard_normal(outer, np.float32)
         result[f"lin{order}.model.1.weight"] = random.random((1, outer, 1, 1), np.float32) / outer
     return {name: torch.from_numpy(value.astype(np.float32)) for name, value in result.items()}
+
+
+@pytest.fixture(scope="module")
+def weights() -> dict[str, torch.Tensor]:
+    return random_weights()
 
 
 @pytest.fixture(scope="module")
