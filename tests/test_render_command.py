@@ -217,3 +217,10 @@ def test_a_killed_render_leaves_whole_files_and_goes_on(fitted_run, private_cach
     pictures = sorted(out.glob("*.png"))
     assert len(pictures) == 4 and {read_image(path).shape for path in pictures} == {(44, 30, 3)}
     assert all((out / name).stat().st_mtime_ns == times[name] for name in left if name.endswith(".png")), "they are not drawn again"
+
+
+def test_a_missing_codec_is_one_line_and_the_pictures_stay(fitted_run, private_cache, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("mitsuba_avatar.reporting.video._CODEC", "h000")
+    assert main([str(fitted_run), "--format", "mp4", *SMALL, "--out", str(tmp_path / "out")]) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("render: ")]
+    assert "h000" in line and len(list((tmp_path / "out").glob("*.png"))) == 4 and not (tmp_path / "out.mp4").exists()

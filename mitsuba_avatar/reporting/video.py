@@ -30,7 +30,7 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "H W 3"]], 
 
     Raises:
         ValueError: no frames, a change of size, or a frame rate that is not positive.
-        RuntimeError: if PyAV's FFmpeg lacks the encoder; the message says what to install.
+        OSError: if PyAV's FFmpeg lacks the encoder; the message says what to install.
         OSError: if the file cannot be written.
     """
     if not 0 < fps < float("inf"):
@@ -58,7 +58,7 @@ def _video_stream(container: av.container.OutputContainer, shape: tuple[int, ...
     try:
         stream = container.add_stream(_CODEC, rate=Fraction(fps).limit_denominator(1001))
     except av.codec.codec.UnknownCodecError as error:
-        raise RuntimeError(
+        raise OSError(
             f"write_video(): expected an FFmpeg with the {_CODEC} encoder; this PyAV has none. "
             "Install PyAV's own wheel: pip install --force-reinstall av."
         ) from error

@@ -50,6 +50,6 @@ def test_failures_say_why_and_keep_the_old_file(tmp_path, without_shape_checks):
 
 def test_a_missing_encoder_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("mitsuba_avatar.reporting.video._CODEC", "libx264_absent")
-    with pytest.raises(RuntimeError, match="expected an FFmpeg with the libx264_absent encoder"):
+    with pytest.raises(OSError, match="expected an FFmpeg with the libx264_absent encoder"):
         write_video(tmp_path / "a.mp4", [gradient(16, 32, 0)], fps=10.0)
     assert not list(tmp_path.iterdir())
