@@ -10,13 +10,13 @@ METRICS = {
         "train": {"seen": {"psnr": 31.256, "ssim": 0.9, "silhouette_iou": 0.98765, "vertex_error_mm": 3.0, "images": 12}},
         "test": {"held_out": {"psnr": 28.0, "ssim": 0.85, "silhouette_iou": 0.97, "vertex_error_mm": 8.125, "images": 6}},
     },
-    "nearest_frame": {"test": {"held_out": {"psnr": 20.5, "ssim": 0.5, "images": 6, "lpips": 0.25}}},
+    "nearest_frame": {"test": {"held_out": {"psnr": 20.5, "ssim": 0.5, "images": 6, "depth_error": 0.25}}},
 }
 
 
 def test_methods_of_one_split_stand_below_each_other():
     headings, rows = metric_rows(METRICS)
-    assert headings == ["split", "cameras", "method", "PSNR (dB) ↑", "SSIM ↑", "IoU ↑", "vertices (mm) ↓", "images", "lpips"]
+    assert headings == ["split", "cameras", "method", "PSNR (dB) ↑", "SSIM ↑", "IoU ↑", "vertices (mm) ↓", "images", "depth_error"]
     assert rows == [
         ["train", "seen", "avatar", "31.26", "0.9000", "0.9877", "3.00", "12", "-"],
         ["test", "held_out", "avatar", "28.00", "0.8500", "0.9700", "8.12", "6", "-"],
