@@ -1,7 +1,8 @@
-"""Take a fitted avatar to other programs: `python -m mitsuba_avatar.export RUN [--format glb obj ply usd textures]`.
+"""Take a fitted avatar to other programs: `python -m mitsuba_avatar.export RUN [--format glb usdskel obj ply usd textures]`.
 
-A GLB holds skeleton, skin, shapes of the face, one texture and the motion of a driving capture; OBJ, PLY and USD hold the posed surfaces
-frame by frame; textures come as EXR (linear) and PNG (sRGB). What a format cannot hold is measured and printed; docs/export.md has more.
+A GLB, or a USD file with UsdSkel, holds skeleton, skin, shapes of the face, one texture and the motion of a driving capture; OBJ, PLY
+and a USD point cache hold the posed surfaces frame by frame; textures come as EXR (linear) and PNG (sRGB). What a format cannot hold is
+measured and printed; docs/export.md has more.
 """
 
 import io
@@ -28,13 +29,13 @@ class ExportCommand:
     """Write a run's avatar in formats of other programs."""
 
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
-    format: tuple[Literal["glb", "obj", "ply", "usd", "textures"], ...] = ("glb", "textures")  # any of them
+    format: tuple[Literal["glb", "usdskel", "obj", "ply", "usd", "textures"], ...] = ("glb", "textures")  # any of them
     split: Literal["test", "train"] = "test"  # frames that drive the avatar
     frames: int = 0  # how many, from the split's first on; 0: all
-    influences: Literal[4, 8] = 4  # glb: joints per vertex
-    pose_shapes: int = 16  # glb: principal shapes of the decoder's surfaces; 0: the skeleton alone moves
-    face_shapes: Literal["auto", "actions", "principal", "none"] = "auto"  # glb: facial actions, or principal shapes of the decoder
-    texture: Literal["radiance", "albedo"] = "radiance"  # of glb, obj and usd: as captured, or to be lit
+    influences: Literal[4, 8] = 4  # glb, usdskel: joints per vertex
+    pose_shapes: int = 16  # glb, usdskel: principal shapes of the decoder's surfaces; 0: the skeleton alone moves
+    face_shapes: Literal["auto", "actions", "principal", "none"] = "auto"  # glb, usdskel: facial actions, or principal shapes
+    texture: Literal["radiance", "albedo"] = "radiance"  # of all but ply: as captured, or to be lit
     captured_light: str = "auto"  # divided out for albedo: auto (the capture's own), uniform, or a scene
     validate: bool = False  # glb: also run the Khronos validator (node and the npm package gltf-validator)
     capture: str = ""  # driving capture of the same rig; default: the run's
@@ -62,8 +63,11 @@ def main(arguments: list[str] | None = None) -> int:
 def _export(command: ExportCommand) -> Path:
     # Imported after the variant is set, because these modules load torch and Dr.Jit.
     from mitsuba_avatar.exporting.character import CharacterSettings, make_character, play
+    from mitsuba_avatar.exporting.usd import load_usd
     from mitsuba_avatar.loaded_run import LoadedRun
 
+    if set(command.format) & {"usd", "usdskel"}:
+        load_usd()  # a missing package is told before the long work, not after it
     settings = CharacterSettings(command.influences, command.pose_shapes, command.face_shapes)
     loaded = LoadedRun.open(command.run, command.capture, command.checkpoint)
     folder = Path(command.out) if command.out else loaded.run.path / "export"
@@ -72,9 +76,13 @@ def _export(command: ExportCommand) -> Path:
     frames = frames[: command.frames] if command.frames else frames
     texture = _write_textures(command, loaded, folder) if set(command.format) != {"ply"} else None
     motion: Motion
-    if "glb" in command.format:
+    if set(command.format) & {"glb", "usdskel"}:
         character = make_character(loaded.avatar, loaded.run.rig, loaded.capture, frames, settings)
-        _write_glb(command, folder / "avatar.glb", character, texture)
+        _print_costs(character.costs_mm)
+        if "glb" in command.format:
+            _write_glb(command, folder / "avatar.glb", character, texture)
+        if "usdskel" in command.format:
+            _write_usd_character(command, folder / "avatar_skeleton.usdc", character)
         motion = character.motion
     elif set(command.format) & {"obj", "ply", "usd"}:
         motion = play(loaded.avatar, loaded.capture, frames)
@@ -119,18 +127,38 @@ def _write_glb(command: ExportCommand, path: Path, character: "Character", textu
     Image.fromarray(texture).save(data, format="png")
     write_glb(path, character, data.getvalue(), is_lit=command.texture == "albedo")
     check_reread(path, character)
-    errors = posing_error_mm(path, character)
-    costs = character.costs_mm | {"all of it, played by glTF's rules": (float(np.sqrt(np.mean(errors**2))), float(errors.max()))}
-    for name, (typical, largest) in costs.items():
-        sys.stdout.write(f"{name}: {typical:.2f} mm root mean square, {largest:.1f} mm at most\n")
-    facts: dict[str, object] = {"costs_mm": costs, "shapes": character.shapes.names, "frames": len(character.motion.root)}
+    facts = _played(character, "all of it, played by glTF's rules", posing_error_mm(path, character))
     if command.validate:
         report = validate_gltf(path)
         facts["validator"] = vars(report)
         sys.stdout.write(f"Khronos validator: {report.errors} errors, {report.warnings} warnings\n")
         for message in report.messages[:10]:
             sys.stdout.write(f"  {message}\n")
-    with atomic_path(path.with_name("avatar.json")) as temporary:
+    _write_facts(path.with_suffix(".json"), facts)
+
+
+def _write_usd_character(command: ExportCommand, path: Path, character: "Character") -> None:
+    """The character for USD, posed by USD itself and measured; figures go to the terminal and into a file beside it."""
+    from mitsuba_avatar.exporting.usd import usd_posing_error_mm, write_usd_character
+
+    write_usd_character(path, character, f"textures/{command.texture}.png", is_lit=command.texture == "albedo")
+    _write_facts(path.with_suffix(".json"), _played(character, "all of it, posed by USD", usd_posing_error_mm(path, character)))
+
+
+def _played(character: "Character", name: str, errors_mm: np.ndarray) -> dict[str, object]:
+    """Print how far a written file is from the avatar; returns what stands in the file beside it."""
+    cost = {name: (float(np.sqrt(np.mean(np.square(errors_mm, dtype=np.float64)))), float(errors_mm.max()))}
+    _print_costs(cost)
+    return {"costs_mm": character.costs_mm | cost, "shapes": character.shapes.names, "frames": len(character.motion.root)}
+
+
+def _print_costs(costs_mm: dict[str, tuple[float, float]]) -> None:
+    for name, (typical, largest) in costs_mm.items():
+        sys.stdout.write(f"{name}: {typical:.2f} mm root mean square, {largest:.1f} mm at most\n")
+
+
+def _write_facts(path: Path, facts: dict[str, object]) -> None:
+    with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
@@ -138,13 +166,14 @@ def _write_sequences(
     command: ExportCommand, loaded: "LoadedRun", folder: Path, motion: "Motion", texture: np.ndarray | None, numbers: list[int]
 ) -> None:
     """Posed surfaces, frame by frame."""
-    from mitsuba_avatar.exporting.sequences import ObjSequence, write_ply, write_usd
+    from mitsuba_avatar.exporting.sequences import ObjSequence, write_ply
+    from mitsuba_avatar.exporting.usd import write_usd_cache
     from mitsuba_avatar.progress import progress_bar
 
     topology = loaded.run.rig.topology
     if "usd" in command.format:
         picture, is_lit = f"textures/{command.texture}.png", command.texture == "albedo"
-        write_usd(folder / "avatar.usdc", motion.vertices, topology, motion.fps, picture, is_lit)
+        write_usd_cache(folder / "avatar.usdc", motion.vertices, topology, motion.fps, picture, is_lit)
     obj = ObjSequence(folder / "obj", topology, texture) if "obj" in command.format and texture is not None else None
     if obj is None and "ply" not in command.format:
         return
