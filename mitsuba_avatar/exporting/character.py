@@ -17,7 +17,7 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skinning import pose_vertices
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.exporting.influences import Influences, strongest_influences, truncation_error_mm
-from mitsuba_avatar.exporting.shapes import Shapes, face_response, facial_actions, principal_motion
+from mitsuba_avatar.exporting.shapes import Shapes, face_response, facial_actions, one_sided, principal_motion
 from mitsuba_avatar.model.avatar import Avatar
 
 FRAMES_AT_ONCE = 8
@@ -30,7 +30,8 @@ class CharacterSettings:
 
     Attributes:
         influences: joints per vertex, 4 or 8.
-        pose_shapes: principal shapes of the decoder's surfaces over the sequence; 0 animates the skeleton alone.
+        pose_shapes: principal shapes of the decoder's surfaces over the sequence, each stored once for either direction; 0 animates the
+            skeleton alone.
         face_shapes: the rig's facial actions, principal shapes of the decoder's face, neither, or the first that there is.
         face_principals: how many of the second kind.
     """
@@ -74,7 +75,7 @@ class Character:
         base_vertices: [V, 3] rest surface that shapes add to.
         influences: of every vertex.
         shapes: of the face first (at rest in the animation), then of the pose.
-        strengths: [N, M] of the shapes over the animation.
+        strengths: [N, M] of the shapes over the animation, 0..1.
         motion: that is animated.
         costs_mm: what was lost: name -> (root mean square, largest), millimetres, over all frames and vertices.
     """
@@ -125,7 +126,8 @@ def make_character(avatar: Avatar, rig: Rig, capture: Capture, frames: Sequence[
         ValueError: no frames, or facial actions of a rig that has none.
     """
     motion = play(avatar, capture, frames)
-    pose = principal_motion(motion.rest_vertices, settings.pose_shapes)
+    signed = principal_motion(motion.rest_vertices, settings.pose_shapes)
+    pose = one_sided(signed)
     face = _face_shapes(avatar, rig, capture, settings)
     influences = strongest_influences(rig.skinning_weights, settings.influences)
     device = avatar.mean_texture.device
@@ -136,7 +138,7 @@ def make_character(avatar: Avatar, rig: Rig, capture: Capture, frames: Sequence[
         )
     strengths = np.concatenate([np.zeros((len(frames), len(face.names)), np.float32), pose.strengths], axis=1)
     costs = {f"skinning with {settings.influences} joints a vertex": _rms_and_largest(skinned.numpy())}
-    costs[f"surface as {len(pose.shapes.names)} pose shapes"] = _rms_and_largest(pose.error_mm)
+    costs[f"surface as {len(signed.shapes.names)} principal shapes"] = _rms_and_largest(signed.error_mm)
     return Character(rig, pose.mean, influences, face + pose.shapes, strengths, motion, costs)
 
 

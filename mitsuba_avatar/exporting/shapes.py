@@ -69,6 +69,25 @@ def principal_motion(rest_vertices: Float32[np.ndarray, "N V 3"], count: int, pr
     return PrincipalMotion(mean.astype(np.float32), Shapes(names, shapes.astype(np.float32)), strengths.astype(np.float32), error_mm)
 
 
+def one_sided(motion: PrincipalMotion) -> PrincipalMotion:
+    """The same surfaces with strengths in 0..1, which is all that some programs (Blender) let a shape have.
+
+    A shape that is used in both directions becomes two: `pose_00`, and `pose_00_minus`, which displaces the other way. Directions that the
+    sequence does not use are left out.
+    """
+    names, displacements, strengths = [], [], []
+    for name, shape, values in zip(motion.shapes.names, motion.shapes.displacements, motion.strengths.T, strict=True):
+        for suffix, sign in (("", 1), ("_minus", -1)):
+            side = np.maximum(sign * values, 0)
+            if side.any():
+                names.append(name + suffix)
+                displacements.append(sign * shape)
+                strengths.append(side)
+    if not names:
+        return motion
+    return PrincipalMotion(motion.mean, Shapes(tuple(names), np.stack(displacements)), np.stack(strengths, axis=1), motion.error_mm)
+
+
 def facial_actions(rig: Rig) -> Shapes | None:
     """The rig's own facial actions; None for a rig that has none (only Anny's do)."""
     if not is_anny(rig):

@@ -1,5 +1,7 @@
 """Truncated skinning and principal shapes: right where nothing is lost, measured where something is."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ import torch
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.exporting.influences import strongest_influences, truncation_error_mm
-from mitsuba_avatar.exporting.shapes import facial_actions, principal_motion
+from mitsuba_avatar.exporting.shapes import facial_actions, one_sided, principal_motion
 from tests.small_rig import make_small_rig
 
 WEIGHTS = np.array([[0.1, 0.5, 0.0, 0.25, 0.15], [0, 0, 1, 0, 0], [0.2, 0.2, 0.2, 0.2, 0.2]], np.float32)
@@ -54,8 +56,26 @@ def test_shapes_rebuild_the_surfaces_that_they_came_from():
     assert fewer.error_mm.mean() < principal_motion(surfaces, 0).error_mm.mean()
 
 
+def test_one_sided_shapes_make_the_same_surfaces_with_strengths_between_0_and_1():
+    """Programs that clip strengths to that range must not lose half of the motion."""
+    surfaces = np.random.default_rng(8).normal(size=(5, 40, 3)).astype(np.float32)
+    signed = principal_motion(surfaces, 3)
+    assert signed.strengths.min() < -0.1
+    motion = one_sided(signed)
+    assert motion.strengths.min() >= 0 and motion.strengths.max() == pytest.approx(1)
+    assert motion.shapes.names[:2] == ("pose_00", "pose_00_minus") and len(set(motion.shapes.names)) == 6
+    expected = np.tensordot(signed.strengths, signed.shapes.displacements, axes=1)
+    np.testing.assert_allclose(np.tensordot(motion.strengths, motion.shapes.displacements, axes=1), expected, atol=1e-6)
+
+
+def test_directions_that_a_sequence_does_not_use_are_left_out():
+    signed = principal_motion(np.random.default_rng(8).normal(size=(5, 40, 3)).astype(np.float32), 2)
+    forwards = dataclasses.replace(signed, strengths=np.abs(signed.strengths))
+    assert one_sided(forwards).shapes.names == ("pose_00", "pose_01")
+
+
 def test_a_surface_that_stands_still_has_no_shapes():
-    motion = principal_motion(np.ones((4, 7, 3), np.float32), 5)
+    motion = one_sided(principal_motion(np.ones((4, 7, 3), np.float32), 5))
     assert motion.shapes.displacements.shape == (0, 7, 3) and motion.strengths.shape == (4, 0) and not motion.error_mm.any()
 
 
