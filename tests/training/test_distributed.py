@@ -62,8 +62,8 @@ def test_two_ranks_train_like_one(drawn_capture, private_cache, tmp_path):
     assert ended.stderr.count("Done in") == 1, "one rank speaks"
     assert "Warning" not in ended.stderr
     (one,), (two,) = (read_records(tmp_path / name / "metrics.jsonl") for name in ("one", "two"))
-    tolerances = {"image": 0.05, "mask": 0.1, "geometry": 0.05, "laplacian": 0.15, "kl": 0.1, "loss": 0.05}
-    tolerances |= {"perturbation": 1.0}  # nearly zero after the first steps, and noise from there on
+    tolerances = {"image": 0.05, "mask": 0.1, "geometry": 0.05, "laplacian": 0.15, "loss": 0.05}
+    tolerances |= {"kl": 0.5, "perturbation": 1.0}  # nearly zero here: the encoder begins near the prior, keypoints settle in a few steps
     for term, tolerance in tolerances.items():
         assert two[term] == pytest.approx(one[term], rel=tolerance), term
     assert two["validation_psnr"] == pytest.approx(one["validation_psnr"], abs=0.2)
