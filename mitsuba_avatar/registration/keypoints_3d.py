@@ -15,6 +15,7 @@ from mitsuba_avatar.registration.keypoints_2d import LANDMARKS, in_landmark_orde
 from mitsuba_avatar.registration.people import FollowingLimits, follow_person
 from mitsuba_avatar.registration.recording import RecordedView, Recording
 from mitsuba_avatar.registration.settings import KeypointSettings
+from mitsuba_avatar.registration.synchronization import require_synchronized
 from mitsuba_avatar.registration.triangulation import triangulate_robustly
 
 REFERENCE_HEIGHT = 1920.0  # rows at which settings count pixels
@@ -52,7 +53,8 @@ def find_person(
         progress: called as progress(done, total).
 
     Raises:
-        FileNotFoundError, ValueError: files, as `read_people`; nobody is seen, or people cross, as `follow_person`; no order makes a body.
+        FileNotFoundError, ValueError: files, as `read_people`; nobody is seen, or people cross, as `follow_person`; a video
+            is out of step, as `require_synchronized`; no order makes a body.
     """
     views = list(recording.views.values())
     targets = list(cameras.values())
@@ -75,6 +77,8 @@ def find_person(
         )
     # Points are grouped and followed before their names are known: the numbers alone say which belong together.
     followed = follow_person(targets, detections, recording.fps, limits)
+    if settings.checks_synchronization:
+        require_synchronized(targets, followed, recording.fps)
     names = orders_of_length(followed.shape[2]) if settings.order == "auto" else [settings.order]
     few = np.unique(np.linspace(0, len(followed) - 1, min(ORDER_FRAMES, len(followed))).round().astype(int))
     candidates = [triangulate_person(targets, _ordered(followed[few], name), name, settings) for name in names]

@@ -53,6 +53,7 @@ class KeypointSettings:
     inlier_pixels: float = 40.0  # a view that a triangulated point misses by more is an outlier
     person_pixels: float = 60.0  # two detections whose median triangulation error is larger are different people
     fastest: float = 6.0  # metres a second that somebody moves at most: the gate of tracking
+    checks_synchronization: bool = True  # refuses videos of which one shows other moments, as far as the person's motion tells
     refines_cameras: bool = True  # calibrations drift: keypoints of all frames correct where cameras stand and look
     camera_turn: float = 0.01  # radians that a camera may have turned since it was calibrated (one standard deviation)
     camera_shift: float = 0.03  # metres that it may have moved
