@@ -30,6 +30,7 @@ SIZES = ((128, 128), (256, 256), (512, 512), (160, 256))  # width, height
 BATCHES = ((1, 1), (8, 1), (8, 4))  # views, meshes
 OCCLUSION_SIZE, OCCLUSION_RAYS = 256, 64
 WARM_UP = 3  # calls before the first round: kernels compile, buffers are allocated
+TURN_SECONDS = 0.25  # at least, of counted calls
 
 
 @dataclass(frozen=True)
@@ -178,16 +179,23 @@ def write_bias_table(rig: Rig, rounds: int) -> None:
 
 
 def take_turns(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, float]:
-    """Median milliseconds of every call over `rounds` rounds in which each has one turn."""
+    """Milliseconds a call: the median over `rounds` rounds, in each of which every contender has one turn.
+
+    In its turn a contender runs in a loop, as a training does, until `TURN_SECONDS` have passed. The first call of a turn is not
+    counted, whoever's it is: it pays for what the others left in caches and in the allocator.
+    """
     for call in calls.values():
         for _ in range(WARM_UP):
             call()
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
-            started = time.perf_counter()
             call()
-            times[name].append(1e3 * (time.perf_counter() - started))
+            started, count = time.perf_counter(), 0
+            while count == 0 or time.perf_counter() - started < TURN_SECONDS:
+                call()
+                count += 1
+            times[name].append(1e3 * (time.perf_counter() - started) / count)
     return {name: float(np.median(values)) for name, values in times.items()}
 
 

@@ -27,8 +27,8 @@ from mitsuba_avatar.files import atomic_path, cache_folder
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.bridge import flat_array, torch_tensor
 from mitsuba_avatar.rendering.environment_map import EnvironmentMap
+from mitsuba_avatar.rendering.pixel_sampling import golden_lattice, random_shift
 from mitsuba_avatar.rendering.scene import MeshScene
-from mitsuba_avatar.rendering.visibility import TEA_ROUNDS, golden_lattice
 
 LIFT = 1e-3  # metres from the surface to a ray's start: past the surface itself, below any real crevice
 
@@ -119,8 +119,7 @@ class AmbientOcclusion:
         texel, ray_index = lane // self.rays, lane % self.rays
         origin = dr.gather(mi.Point3f, points, texel * 2)
         normal = dr.normalize(dr.gather(mi.Normal3f, points, texel * 2 + 1))
-        first, second = mi.sample_tea_32(texel, dr.opaque(mi.UInt32, seed), TEA_ROUNDS)
-        position = golden_lattice(ray_index, self.rays, mi.Point2f(mi.Float(first) * 2.0**-32, mi.Float(second) * 2.0**-32))
+        position = golden_lattice(ray_index, self.rays, random_shift(texel, dr.opaque(mi.UInt32, seed)))
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(position))
         ray = mi.Ray3f(origin + normal * LIFT, direction)
         ray.maxt = self.distance

@@ -7,21 +7,20 @@ from mitsuba_avatar.rendering.surface_tables import SurfaceTables
 
 
 @dataclass
-class FaceGrid:
-    """Which faces each cell, a small square of pixels of one view, may show.
+class FaceBoxes:
+    """Faces that views may show, one per lane, with the bounding boxes of their projections in units of the film (`face_boxes`).
 
     Attributes:
-        cell: pixels on a side; across, down: cells of one film.
-        count: [B * down * across] faces of each cell; end: where in `faces` those of a cell end.
-        faces: indices into the topology's faces, cell after cell.
+        view_index, face: 0..B-1 and 0..F-1.
+        first_x, first_y, last_x, last_y: units under the box.
     """
 
-    cell: int
-    across: int
-    down: int
-    count: object
-    end: object
-    faces: object
+    view_index: object
+    face: object
+    first_x: object
+    first_y: object
+    last_x: object
+    last_y: object
 
 
 @dataclass
@@ -37,7 +36,7 @@ class SurfaceBatch:
         film: (width, height) pixels.
         seed, seed_gradient: opaque UInt32, decorrelated.
         triangles, front: what `facing` finds.
-        points, grid: what `face_grid` finds; grid is None where no view shows a face.
+        points, boxes: what `face_boxes` finds; boxes is None where no view shows a face.
     """
 
     tables: SurfaceTables
@@ -56,7 +55,7 @@ class SurfaceBatch:
     triangles: object = None
     front: object = None
     points: object = None
-    grid: FaceGrid | None = None
+    boxes: FaceBoxes | None = None
 
     @property
     def num_pixels(self) -> int:
@@ -82,6 +81,13 @@ class SurfaceBatch:
     def point(self, view_index, vertex):
         """Position (Vector3f) of vertex 0..V-1 of a view's mesh in the view's camera axes."""
         return packet_vector(self.points, view_index * self.num_vertices + vertex)
+
+    def corner_points(self, view_index, face) -> tuple:
+        """Positions (Vector3f) of a face's corners in the view's camera axes."""
+        import drjit as dr
+
+        corners = dr.gather(loaded_mitsuba().Vector4u, self.tables.faces, face)
+        return tuple(self.point(view_index, corner) for corner in (corners.x, corners.y, corners.z))
 
 
 def packet_vector(packets, index):

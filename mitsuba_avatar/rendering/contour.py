@@ -18,11 +18,13 @@ from dataclasses import dataclass
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch, packet_vector
 from mitsuba_avatar.rendering.facing import VIEWS_PER_WORD, Triangle, num_words
+from mitsuba_avatar.rendering.pixel_sampling import TEA_ROUNDS
+from mitsuba_avatar.rendering.rasterization import nearest_faces
 from mitsuba_avatar.rendering.shading import AdjointImage, interpolated_uv
 from mitsuba_avatar.rendering.surface_tables import NO_FACE
 from mitsuba_avatar.rendering.texture_lookup import Footprint
 from mitsuba_avatar.rendering.views import NEAR, View
-from mitsuba_avatar.rendering.visibility import TEA_ROUNDS, nearest_face
+from mitsuba_avatar.rendering.visibility import meeting_point
 
 # Distance between an edge and the ray that looks past it, as a share of the film's longer side. It must be far below a triangle's size:
 # smooth surfaces have clusters of near-contour edges that hide each other by fractions of a pixel, and a ray that steps over the hiding
@@ -171,7 +173,7 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
 
     mi = loaded_mitsuba()
     tables = batch.tables
-    edges = contour_edges(batch) if batch.grid is not None else None
+    edges = contour_edges(batch) if batch.boxes is not None else None
     if edges is None:
         return None
     kept, front, front_seam = edges
@@ -274,9 +276,10 @@ def _background(batch: SurfaceBatch, view: View, view_index, position, depth, se
     """
     import drjit as dr
 
-    sight = nearest_face(batch, view, view_index, position, active)
-    is_nearer = sight.depth < depth * (1.0 - DEPTH_TOLERANCE)
-    active = active & dr.select(second_face == NO_FACE, ~is_nearer, sight.is_hit & (sight.face == second_face))
-    uv = interpolated_uv(batch.tables, sight.face, sight.barycentric)
-    radiance = Footprint.at(uv, view_index, *batch.texture_size).value(batch.textures, sight.is_hit & active)
-    return dr.select(sight.is_hit, radiance, 0.0), sight.is_hit, active
+    is_hit, face = nearest_faces(batch, view_index, position, active)
+    barycentric, distance = meeting_point(batch, view, view_index, face, position)
+    is_nearer = is_hit & (distance < depth * (1.0 - DEPTH_TOLERANCE))
+    active = active & dr.select(second_face == NO_FACE, ~is_nearer, is_hit & (face == second_face))
+    uv = interpolated_uv(batch.tables, face, barycentric)
+    radiance = Footprint.at(uv, view_index, *batch.texture_size).value(batch.textures, is_hit & active)
+    return dr.select(is_hit, radiance, 0.0), is_hit, active

@@ -16,7 +16,7 @@ from mitsuba_avatar.rendering.batch import SurfaceBatch
 from mitsuba_avatar.rendering.surface_tables import SurfaceTables
 from mitsuba_avatar.rendering.texture_lookup import Footprint
 from mitsuba_avatar.rendering.views import View
-from mitsuba_avatar.rendering.visibility import Hits, pixel_of_slot
+from mitsuba_avatar.rendering.visibility import Hits
 
 
 def face_corners(batch: SurfaceBatch, view_index, face) -> tuple:
@@ -73,7 +73,8 @@ def scatter_image(batch: SurfaceBatch, hits: Hits, radiance, image, mask) -> Non
         body=lambda sample, total: (sample + 1, total + dr.gather(mi.Vector4f, samples, lane * count + sample)),
         labels=("sample", "total"),
     )
-    pixel, view_index, x, y = pixel_of_slot(batch, hits.cells, lane)
+    view_index, x, y = hits.tiles.pixel_of_slot(lane)
+    pixel = (view_index * batch.film[1] + y) * batch.film[0] + x
     is_on_film = (x < batch.film[0]) & (y < batch.film[1])
     _write_pixels(batch, pixel, view_index, total * (1.0 / count), image, mask, is_on_film)
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mitsuba_avatar.body.rig import Topology
-from mitsuba_avatar.rendering import contour, face_grid, facing, shading, visibility
+from mitsuba_avatar.rendering import contour, face_boxes, facing, shading, visibility
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch
 from mitsuba_avatar.rendering.bridge import differentiable, flat_array, torch_tensor
@@ -179,8 +179,8 @@ class SurfaceRenderer:
         )
         batch.triangles = facing.pack_triangles(batch)
         batch.front = facing.views_from_front(batch)
-        batch.points = face_grid.camera_points(batch)
-        batch.grid = face_grid.build_face_grid(batch)
+        batch.points = face_boxes.camera_points(batch)
+        batch.boxes = face_boxes.list_faces(batch)
         return batch
 
     @staticmethod

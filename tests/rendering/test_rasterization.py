@@ -1,4 +1,4 @@
-"""What a camera ray meets first, found through cells of the film: against every triangle in float64, and against Mitsuba's own rays."""
+"""What a camera ray meets first, found by rasterization: against every triangle in float64, and against Mitsuba's own rays."""
 
 import drjit as dr
 import numpy as np
@@ -9,11 +9,13 @@ from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch
 from mitsuba_avatar.rendering.bridge import flat_array
 from mitsuba_avatar.rendering.cameras import CameraBatch
-from mitsuba_avatar.rendering.face_grid import cell_size
+from mitsuba_avatar.rendering.face_boxes import FilmUnits
+from mitsuba_avatar.rendering.pixel_sampling import jitter, random_shift
+from mitsuba_avatar.rendering.rasterization import nearest_faces
 from mitsuba_avatar.rendering.scene import MeshScene
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.rendering.views import View, place
-from mitsuba_avatar.rendering.visibility import nearest_face
+from mitsuba_avatar.rendering.visibility import meeting_point, tile_bits, trace_views
 from tests.rendering import meshes, reference
 
 FILM = (90, 66)
@@ -31,8 +33,9 @@ def look(batch: SurfaceBatch, view_index: np.ndarray, pixels: np.ndarray) -> tup
     mi = loaded_mitsuba()
     index = mi.UInt32(view_index.astype(np.uint32))
     position = mi.Point2f(*(mi.Float(column.astype(np.float32)) for column in pixels.T))
-    sight = nearest_face(batch, View.gather(batch.views, index), index, position)
-    return sight.depth.numpy(), sight.face.numpy()
+    is_met, face = nearest_faces(batch, index, position, mi.Bool(True))
+    _, depth = meeting_point(batch, View.gather(batch.views, index), index, face, position)
+    return dr.select(is_met, depth, dr.inf).numpy(), face.numpy()
 
 
 def positions(count: int, seed: int = 0) -> np.ndarray:
@@ -103,12 +106,11 @@ def test_only_faces_that_can_be_met_first_are_listed(distance):
     vertices, topology = meshes.sphere(2)
     cameras = meshes.orbit(2, *FILM, distance=distance)
     batch = make_batch(SurfaceRenderer(topology, *FILM), torch.tensor(vertices, dtype=torch.float32)[None], cameras, [0, 0])
-    listed = np.unique(batch.grid.faces.numpy())
+    listed = np.unique(batch.boxes.face.numpy())
     normals = np.cross(*(vertices[topology.faces[:, k]] - vertices[topology.faces[:, 0]] for k in (1, 2)))
     heights = ((cameras.centers.double().numpy()[:, None] - vertices[topology.faces[:, 0]]) * normals).sum(axis=2)
     is_front = (heights > 0).any(axis=0)
     assert np.array_equal(listed, np.flatnonzero(is_front)) if distance > 1 else len(listed) > 20 and not is_front[listed].any()
-    assert int(dr.sum(batch.grid.count)[0]) == len(batch.grid.faces) == int(dr.max(batch.grid.end)[0])
 
 
 def test_an_open_mesh_is_listed_from_behind_too():
@@ -117,11 +119,30 @@ def test_an_open_mesh_is_listed_from_behind_too():
     for turned in (vertices, vertices * [-1, -1, 1]):  # by half a turn about the vertical axis
         turned = torch.tensor(turned, dtype=torch.float32)[None]
         batch = make_batch(SurfaceRenderer(topology, *FILM), turned, cameras, [0, 0])
-        assert np.array_equal(np.unique(batch.grid.faces.numpy()), np.arange(len(topology.faces)))
+        assert np.array_equal(np.unique(batch.boxes.face.numpy()), np.arange(len(topology.faces)))
 
 
-def test_cells_grow_with_the_film():
-    assert [cell_size(film) for film in ((30, 22), (128, 90), (160, 256), (512, 512), (2668, 4096))] == [1, 1, 2, 4, 32]
+def test_tiles_and_bins_grow_with_the_film():
+    films = ((30, 22), (128, 90), (160, 256), (512, 512), (2668, 4096))
+    assert [1 << tile_bits(film) for film in films] == [1, 1, 2, 4, 32]
+    assert [FilmUnits.of(film).bins for film in films] == [(240, 176), (256, 180), (160, 256), (256, 256), (167, 256)]
+
+
+@pytest.mark.parametrize("samples_per_pixel", [1, 3, 5, 8])
+def test_pixels_show_what_single_rays_meet(samples_per_pixel):
+    """The two ways through a film agree: samples of pixels under a face's box, and the same positions sorted into bins."""
+    mi = loaded_mitsuba()
+    vertices, topology = meshes.sphere(3)
+    vertices = torch.tensor(np.stack([vertices, 0.6 * vertices + [0.3, 0.1, 0.2]]), dtype=torch.float32)
+    renderer = SurfaceRenderer(topology, 300, 220, samples_per_pixel=samples_per_pixel)
+    batch = make_batch(renderer, vertices, meshes.orbit(3, 300, 220), [0, 1, 1])
+    hits = trace_views(batch)
+    view_index, x, y = hits.tiles.pixel_of_slot(hits.slot // samples_per_pixel)
+    offset = jitter(random_shift(hits.pixel, batch.seed), hits.slot % samples_per_pixel, samples_per_pixel)
+    is_met, face = nearest_faces(batch, view_index, mi.Point2f(x, y) + offset, mi.Bool(True))
+    assert hits.count > 3000 * samples_per_pixel and dr.all(is_met)
+    assert (face.numpy() != hits.face.numpy()).mean() < 1e-4
+    assert len(np.unique(hits.slot.numpy())) == hits.count
 
 
 def test_equal_seeds_give_equal_images_to_the_last_bit():
