@@ -49,7 +49,7 @@ class DriveCommand:
     imputation: ImputationChoice = "zero"  # of the latent code
     latents: str = ""  # .npy [N, Z] with the latent codes themselves, as reconstruct writes them; goes before --imputation
     range: Literal["clamp", "project", "none"] = "clamp"  # angles out of range: to the rig's limits, onto the training poses, as they are
-    split: Literal["test", "train", "validation", "all"] = "test"  # frames of a capture
+    split: Literal["test", "train", "validation", "stress", "all"] = "test"  # frames of a capture
     seconds: float = 0.0  # of the recording; 0: all
     fps: float = 0.0  # to read a recording at, and of arrays; 0: its own (BVH: at most 30, arrays: 10)
     in_place: bool = False  # leave out the way over the floor

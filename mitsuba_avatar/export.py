@@ -30,7 +30,7 @@ class ExportCommand:
 
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
     format: tuple[Literal["glb", "usdskel", "obj", "ply", "usd", "textures"], ...] = ("glb", "textures")  # any of them
-    split: Literal["test", "train"] = "test"  # frames that drive the avatar
+    split: Literal["test", "train", "stress"] = "test"  # frames that drive the avatar
     frames: int = 0  # how many, from the split's first on; 0: all
     influences: Literal[4, 8] = 4  # glb, usdskel: joints per vertex
     pose_shapes: int = 16  # glb, usdskel: principal shapes of the decoder's surfaces; 0: the skeleton alone moves

@@ -205,7 +205,7 @@ class Fit:
     def _preview_shots(self) -> list[Shot]:
         """A training view, and the held-out cameras' views of two test frames."""
         capture = self.capture
-        splits = {frame.split for frame in capture.frames}
+        splits = {frame.purpose for frame in capture.frames}
         seen, held_out = capture.camera_names(held_out=False), capture.camera_names(held_out=True)
         train = capture.frame_indices("train")
         shots = [Shot(train[len(train) // 2], seen[0])]
@@ -215,7 +215,7 @@ class Fit:
     def _draw_orbit(self, frames: list[int]) -> None:
         """The avatar driven by the test split, a camera walking around it."""
         evaluation, capture = self.settings.evaluation, self.capture
-        split = capture.frame_indices(capture.frames[frames[0]].split)
+        split = capture.frame_indices(capture.frames[frames[0]].purpose)
         along = [split[i * len(split) // evaluation.orbit_frames] for i in range(evaluation.orbit_frames)]
         rows = sorted(set(along))
         signals = DrivingSignals.of_capture(capture, rows)

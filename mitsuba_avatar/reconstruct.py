@@ -36,7 +36,7 @@ class ReconstructCommand:
 
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
     capture: str = ""  # another capture of the same rig; default: the one it was trained on
-    split: Literal["test", "train"] = "test"
+    split: Literal["test", "train", "stress"] = "test"
     first: int | None = None  # number of the first frame; default: the split's
     frames: int = 8  # how many; 0: all from the first on
     every: int = 1  # take every n-th frame of the split

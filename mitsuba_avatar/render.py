@@ -38,7 +38,7 @@ class RenderCommand:
     path: Literal["orbit", "turntable", "spiral", "keyframes", "held_out", "cameras"] = "orbit"  # the cameras' way
     file: str = ""  # of keyframes (YAML) or of cameras (a cameras.json)
     format: tuple[Literal["png", "exr", "mp4", "ply"], ...] = ("png",)  # any of them; ply: the posed mesh, metres, world axes
-    split: Literal["test", "train"] = "test"  # frames that drive the avatar, spread over the path
+    split: Literal["test", "train", "stress"] = "test"  # frames that drive the avatar, spread over the path
     frames: int = 24  # how many pictures the path has
     hold: int | None = None  # drive with this one frame (number) of the capture throughout
     play: int | None = None  # drive with consecutive frames of the capture from this one (number) on

@@ -99,7 +99,7 @@ def open_viewed_avatar(loaded: "LoadedRun", motion: str = "", checkpoint: str = 
     from mitsuba_avatar.viewing.session import MOST_NAMED_FACE_ENTRIES, ViewedAvatar
 
     run, capture = loaded.run, loaded.capture
-    splits = {frame.split for frame in capture.frames}
+    splits = {frame.purpose for frame in capture.frames}
     training = DrivingSignals.of_capture(capture, capture.frame_indices("train" if "train" in splits else None))
     others = {split: DrivingSignals.of_capture(capture, capture.frame_indices(split)) for split in sorted(splits - {"train"})}
     latents = None

@@ -35,7 +35,6 @@ from mitsuba_avatar.reporting.metrics import l1_in_mask, mse_in_mask, psnr_from_
 from mitsuba_avatar.training.statistics import evenly_spaced
 
 MILLIMETRES = 1000.0  # in a metre
-STRESS = "stress"  # segments whose name begins so are reported apart
 AT_ONCE = 8  # frames
 PRINCIPAL = 16  # directions of the hidden state that the probe is asked for
 RIDGE = 10.0  # of the regression on pose that the hidden state is what is left of, in deviations of an angle
@@ -52,9 +51,9 @@ class Splits:
     @classmethod
     def of(cls, capture: Capture, most: int) -> "Splits":
         """At most `most` evenly spaced frames of each."""
-        groups: dict[str, list[int]] = {"train": [], "validation": [], "test": [], STRESS: []}
+        groups: dict[str, list[int]] = {"train": [], "validation": [], "test": [], "stress": []}
         for index, frame in enumerate(capture.frames):
-            groups[STRESS if frame.segment.startswith(STRESS) else frame.split].append(index)
+            groups[frame.purpose].append(index)
         return cls({name: evenly_spaced(frames, most) for name, frames in groups.items() if frames})
 
 
@@ -125,7 +124,7 @@ class Study:
 
     def frames(self, *splits: str) -> list[int]:
         """Frames of some splits, in order of time, without stress segments."""
-        return [i for i, frame in enumerate(self.capture.frames) if frame.split in splits and not frame.segment.startswith(STRESS)]
+        return [i for i, frame in enumerate(self.capture.frames) if frame.purpose in splits]
 
     def groups(self) -> dict[str, np.ndarray]:
         """Masks over vertices to report distances for, apart from all."""

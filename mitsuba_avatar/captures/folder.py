@@ -166,16 +166,18 @@ class Capture:
     def frame_indices(self, split: str | None = None, segment: str | None = None) -> list[int]:
         """Indices of the frames of a split and a segment, in order; None means all.
 
+        Frames of stress segments belong to the split "stress" here, whatever their own is: see `Frame.purpose`.
+
         Raises:
             ValueError: for a split or segment that the capture does not have.
         """
-        for kind, wanted in (("split", split), ("segment", segment)):
-            known = sorted({getattr(frame, kind) for frame in self.frames})
+        for kind, attribute, wanted in (("split", "purpose", split), ("segment", "segment", segment)):
+            known = sorted({getattr(frame, attribute) for frame in self.frames})
             if wanted is not None and wanted not in known:
                 raise ValueError(
                     f"Capture.frame_indices(): expected a {kind} of {known} in {self.path}; got {wanted!r}. Choose one of them."
                 )
-        return [i for i, frame in enumerate(self.frames) if split in (None, frame.split) and segment in (None, frame.segment)]
+        return [i for i, frame in enumerate(self.frames) if split in (None, frame.purpose) and segment in (None, frame.segment)]
 
     def camera_names(self, held_out: bool | None = None) -> list[str]:
         """Names of all cameras (None), of those that training may see (False), or of the held-out ones (True), in file order."""

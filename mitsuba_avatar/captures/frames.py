@@ -15,6 +15,7 @@ from mitsuba_avatar.files import atomic_path
 
 COLUMNS = ("frame", "time", "split", "segment")
 SPLITS = ("train", "validation", "test")
+STRESS = "stress"  # test segments whose name begins so hold motion far from training, and are reported apart
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class Frame:
         time: seconds from the capture's start.
         split: "train" may be learnt from; "validation" is held out within the training takes, to choose settings by; "test" is for
             reporting alone.
-        segment: the take it belongs to, "range_of_motion" say; frames of one segment follow each other in time.
+        segment: the take it belongs to, "range_of_motion" say; frames of one segment follow each other in time. A test
+            segment whose name begins with "stress" is set apart, see `purpose`.
     """
 
     number: int
@@ -40,6 +42,11 @@ class Frame:
                 f"Frame(): expected a number >= 0 and a split of {', '.join(SPLITS)}; got {self.number} and {self.split!r}. "
                 "Correct the frame."
             )
+
+    @property
+    def purpose(self) -> Literal["train", "validation", "test", "stress"]:
+        """The split, but "stress" for frames of a stress segment: no figure of a test split counts them."""
+        return "stress" if self.split == "test" and self.segment.startswith(STRESS) else self.split
 
 
 def save_frames(path: Path | str, frames: Sequence[Frame]) -> None:

@@ -78,7 +78,7 @@ def load_body(path: Path | str, rig: Rig, fps: float = 0.0, split: str = "test",
         path: see the table of this module.
         rig: of the avatar.
         fps: frames per second to read a recording at, and of arrays, which do not say theirs; 0 for the source's own (arrays: 10).
-        split: of a capture's frames: "train", "validation", "test" or "all".
+        split: of a capture's frames: "train", "validation", "test", "stress" or "all".
         seconds: read no more than this; 0 for all.
 
     Raises:

@@ -18,7 +18,6 @@ from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.filming.hidden_state import Error, HiddenState, angles_that_move, measure_hidden_state
 from mitsuba_avatar.filming.motion import body_angles, pose_distances
 from mitsuba_avatar.filming.performance import Performance, Progress
-from mitsuba_avatar.filming.takes import is_stress
 
 INFO = "info.json"
 LOG = "filming_log.csv"
@@ -76,7 +75,7 @@ def hidden_state(performance: Performance, rest_vertices: Float32[np.ndarray, "N
     None if there is nothing to score on. Frames of stress segments are left out.
     """
     frames, person = performance.motion.frames, performance.person
-    scored = [index for index, frame in enumerate(frames) if frame.split == "train" or _is_scored(performance, index)]
+    scored = [index for index, frame in enumerate(frames) if frame.purpose in ("train", "test")]
     kept = np.array(scored[:: -(-len(scored) // MOST_FRAMES)])
     is_train = np.array([frames[index].split == "train" for index in kept])
     if is_train.sum() < 2 or is_train.all():
@@ -120,7 +119,11 @@ def chaos_floor(performance: Performance, progress: Progress) -> Error:
     Simulates every test segment once more. Both garments are compared in the world; their bodies are equal.
     """
     clothing = replace(performance.settings.clothing, start_noise=START_NOISE)
-    scored = [(order, frames) for order, frames in enumerate(performance.motion.segments()) if _is_scored(performance, frames.start)]
+    scored = [
+        (order, frames)
+        for order, frames in enumerate(performance.motion.segments())
+        if performance.motion.frames[frames.start].purpose == "test"
+    ]
     total = sum(frames.stop - frames.start for _, frames in scored)
     coarse, differences = len(performance.person.outfit.mesh.body_vertices), []
     for order, frames in scored:
@@ -128,9 +131,3 @@ def chaos_floor(performance: Performance, progress: Progress) -> Error:
             differences.append(other[:coarse] - performance.garment(frames.start + index)[:coarse])
             progress(len(differences), total)
     return Error.of(np.stack(differences))
-
-
-def _is_scored(performance: Performance, frame: int) -> bool:
-    """Whether a frame is a test frame that is not reported apart."""
-    moment = performance.motion.frames[frame]
-    return moment.split == "test" and not is_stress(moment)

@@ -40,7 +40,6 @@ from mitsuba_avatar.filming.plan import Shard
 from mitsuba_avatar.filming.sensor import Sensor
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.filming.stage import Stage
-from mitsuba_avatar.filming.takes import is_stress
 from mitsuba_avatar.filming.tracking_noise import tracking_noise
 from mitsuba_avatar.filming.truth import TRUTH_FOLDER, OcclusionTruth, write_truth
 from mitsuba_avatar.resources import find_resource
@@ -103,7 +102,7 @@ class _Filming:
         self.settings, self.folder, self.progress = settings, folder, progress
         self.performance = Performance(settings, folder / TRUTH_FOLDER)
         count = len(self.performance)
-        framed = [index for index, frame in enumerate(self.performance.motion.frames) if not is_stress(frame)]
+        framed = [index for index, frame in enumerate(self.performance.motion.frames) if frame.purpose != "stress"]
         outline = np.unique(np.linspace(0, len(framed) - 1, min(len(framed), OUTLINE_FRAMES)).round().astype(int))
         self.dome = place_cameras(self.performance.body_outline([framed[place] for place in outline]), settings)
         rig = self.performance.person.rig

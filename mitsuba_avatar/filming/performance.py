@@ -24,7 +24,6 @@ from mitsuba_avatar.filming.garment_record import GarmentRecord
 from mitsuba_avatar.filming.motion import Motion, perform
 from mitsuba_avatar.filming.person import Person, dress_person
 from mitsuba_avatar.filming.settings import ClothingSettings, StudioSettings
-from mitsuba_avatar.filming.takes import is_stress
 
 Progress = Callable[[int, int], None]  # frames done, frames in all
 STRESS_SUBSTEPS = 800  # a second, at least, of wild motion: at 200 some shirts tear within two seconds
@@ -183,6 +182,6 @@ class Performance:
 
 def steady_enough(clothing: ClothingSettings, frame: Frame) -> ClothingSettings:
     """How the segment of a frame is simulated: as asked for, but wild motion in smaller steps, which are part of what a capture is."""
-    if not is_stress(frame):
+    if frame.purpose != "stress":
         return clothing
     return replace(clothing, substeps_per_second=max(STRESS_SUBSTEPS, clothing.substeps_per_second))

@@ -136,11 +136,6 @@ def frames_of(planned: list[PlannedTake], fps: float) -> tuple[Frame, ...]:
     return tuple(Frame(index, index / fps, split, segment) for index, (split, segment) in enumerate(rows))
 
 
-def is_stress(frame: Frame) -> bool:
-    """Whether a frame belongs to the take of wild motion, which is reported apart and may not shape the rest of a capture."""
-    return frame.segment == STRESS.name
-
-
 def _divide(takes: list[Take], total: int) -> list[int]:
     """Frames of each take by its share, adding up to `total`."""
     if not takes:

@@ -173,7 +173,7 @@ class Evaluator:
 
     def split_frames(self, per_split: int) -> dict[str, list[int]]:
         """At most `per_split` evenly spaced frames of each split that the capture has."""
-        splits = {frame.split for frame in self.capture.frames}
+        splits = {frame.purpose for frame in self.capture.frames}
         return {split: evenly_spaced(self.capture.frame_indices(split), per_split) for split in ("train", "test") if split in splits}
 
     def _frame_metrics(self, drawn: Drawn, batch: FrameBatch, measures: Measures) -> dict[str, float]:

@@ -217,7 +217,7 @@ class Report:
 
     def _split(self) -> str:
         """The split that figures show: test frames where there are some."""
-        splits = {frame.split for frame in self.runs[0].evaluator.capture.frames}
+        splits = {frame.purpose for frame in self.runs[0].evaluator.capture.frames}
         return "test" if "test" in splits else "train"
 
     def _facts(self) -> str:

@@ -41,6 +41,13 @@ def test_selections(small_capture):
     assert small_capture.camera_names(held_out=False) == ["front", "left"]
 
 
+def test_a_stress_segment_is_no_test_take(small_capture):
+    capture = Capture.open(small_capture.path)
+    capture.frames = tuple(replace(frame, split="test", segment="stress_wild") if i == 1 else frame for i, frame in enumerate(FRAMES))
+    assert capture.frame_indices("stress") == [1] and capture.frame_indices("test") == [3]
+    assert Frame(0, 0.0, "train", "stress_free").purpose == "train"
+
+
 def test_wrong_names_and_indices_are_refused(small_capture):
     with pytest.raises(ValueError, match=r"got 'frnt'. Did you mean 'front'"):
         small_capture.image("frnt", 0)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,16 @@ def test_study_tests_are_thirty_to_sixty_degrees_from_training_and_stress_is_far
     validation = np.array([frame.split == "validation" for frame in study.frames])
     assert np.median(distance[validation]) < 20
     assert distance[[frame.split == "train" for frame in study.frames]].max() == 0
+
+
+def test_a_stress_take_changes_no_other_take(rig: Rig):
+    settings = MotionSettings(script="study", train_frames=24, validation_frames=6, test_frames=8)
+    calm = perform(rig, StudioSettings(motion=settings), NAMES)
+    wild = perform(rig, StudioSettings(motion=replace(settings, stress_frames=5)), NAMES)
+    count = len(calm.frames)
+    assert wild.frames[:count] == calm.frames and len(wild.frames) == count + 5
+    for name in ("theta", "root", "actions", "clearance"):
+        np.testing.assert_array_equal(getattr(wild, name)[:count], getattr(calm, name))
 
 
 def test_arms_of_the_study_are_off_the_torso(rig: Rig, study: Motion):
