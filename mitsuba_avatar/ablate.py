@@ -12,11 +12,12 @@ from mitsuba_avatar.ablation.plan import REHEARSAL, plan_runs
 from mitsuba_avatar.ablation.rows import choose_rows
 from mitsuba_avatar.ablation.schedule import default_jobs, run_workers
 from mitsuba_avatar.ablation.table import markdown, write_tables
+from mitsuba_avatar.body.source_captures import capture_folder
 from mitsuba_avatar.command_line import interruptible, parse_command
 from mitsuba_avatar.files import check_writable
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.presets import resolve
-from mitsuba_avatar.progress import StageProgress, progress_bar
+from mitsuba_avatar.progress import StageProgress, progress_bar, tracked
 from mitsuba_avatar.rendering import backend
 from mitsuba_avatar.settings import Settings
 
@@ -25,7 +26,7 @@ from mitsuba_avatar.settings import Settings
 class AblateCommand:
     """Train every row of the ablation table, measure it, write the table."""
 
-    capture: str = ""  # capture folder; default: the studio's preset study, filmed on first use (about 20 minutes)
+    capture: str = ""  # capture folder, or FORMAT:DIR; default: the studio's preset study, filmed on first use (about 20 minutes)
     out: str = ""  # where runs and tables go; default: runs/ablation, runs/rehearsal
     rows: str = ""  # comma-separated; default: all of configs/ablation/
     seeds: int = 1  # how many of each row
@@ -45,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
         rows = choose_rows(command.rows)
         folder = Path(command.out or ("runs/rehearsal" if command.rehearsal else "runs/ablation"))
         check_writable(folder)
-        capture = Path(command.capture) if command.capture else _study(command.variant)
+        capture = capture_folder(command.capture, tracked) if command.capture else _study(command.variant)
         runs = plan_runs(folder, rows, command.seeds, command.budget, capture, [*(REHEARSAL if command.rehearsal else ()), *overrides])
         iterations = sum(run.settings.training.iterations for run in runs)
         with progress_bar("ablation", iterations, sum(run.iterations_done() for run in runs)) as bar:

@@ -97,10 +97,9 @@ def _imputations(command: AnalyzeCommand, loaded: "LoadedRun", study: "Study", p
     """Folder of each driving capture -> its setting, and the figures of every imputation."""
     from mitsuba_avatar.analysis.imputations import drive_of_capture, imputation_figures
     from mitsuba_avatar.driving.training_latents import training_latents
-    from mitsuba_avatar.training.readiness import open_as_set
 
     run, avatar, result = loaded.run, loaded.avatar, {}
-    training = training_latents(run, avatar, lambda: open_as_set(run.capture_path, run.settings.capture), command.checkpoint)
+    training = training_latents(run, avatar, run.open_capture, command.checkpoint)
     for done, path in enumerate(command.drives):
         progress.update("imputations", done, len(command.drives))
         drive = drive_of_capture(run, avatar, path, training)

@@ -5,7 +5,6 @@ with the masks, draws a contact sheet, and exits with 1 and the likely trap wher
 another data set's files, or a Goliath body capture from a capture.
 """
 
-import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from rich.table import Table
 
 from mitsuba_avatar.body.rig import Rig, load_rig
 from mitsuba_avatar.body.skinning import posed_rest_surface
+from mitsuba_avatar.body.source_captures import capture_folder
 from mitsuba_avatar.captures.arrays import FRAME_ARRAYS
 from mitsuba_avatar.captures.checks import check_arrays, check_images
 from mitsuba_avatar.captures.colour import encode_bytes
@@ -44,9 +44,9 @@ def info(path: CapturePath) -> None:
     """List the cameras, frames, arrays and files of a capture, and what is missing.
 
     Args:
-        path: Folder of the capture.
+        path: Folder of the capture, or FORMAT:DIR, a data set of another format.
     """
-    capture = Capture.open(path)
+    capture = Capture.open(capture_folder(path, tracked))
     console = Console()
     description = capture.description
     console.print(
@@ -57,6 +57,9 @@ def info(path: CapturePath) -> None:
         f"licence {description.licence or 'not stated'}, source {description.source or 'not stated'}",
         highlight=False,
     )
+    if description.images_from is not None:
+        place = f"{description.images_from.format}:{description.images_from.path}"
+        console.print(f"images and masks are read in place from {place}", highlight=False, soft_wrap=True)
     console.print(_camera_table(capture))
     console.print(_frame_table(capture))
     console.print(_file_table(capture))
@@ -66,7 +69,7 @@ def check(path: CapturePath, frames: int = 3, out: Path = Path("capture_check"),
     """Check all values of a capture, and on a few frames whether the mesh projects onto the masks; names the likely trap if not.
 
     Args:
-        path: Folder of the capture.
+        path: Folder of the capture, or FORMAT:DIR, a data set of another format.
         frames: How many frames to project, evenly spaced.
         out: Folder for the contact sheet.
         minimum_iou: A camera whose silhouette agrees less than this with the masks is wrong. Loose clothing over an unclothed
@@ -75,6 +78,7 @@ def check(path: CapturePath, frames: int = 3, out: Path = Path("capture_check"),
     """
     if frames < 1 or size < 16:
         raise ValueError(f"check(): expected at least 1 frame and 16 pixels; got {frames} and {size}. Give larger numbers.")
+    path = capture_folder(path, tracked)
     capture = Capture.open(path)
     longest = max(max(camera.width, camera.height) for camera in capture.cameras.values())
     capture = Capture.open(path, image_scale=min(1.0, size / longest))
@@ -83,7 +87,7 @@ def check(path: CapturePath, frames: int = 3, out: Path = Path("capture_check"),
     check_images(capture, tracked(range(len(capture.frames)), "Checking images and masks"))
     indices = np.linspace(0, len(capture.frames) - 1, min(frames, len(capture.frames))).round().astype(int).tolist()
     meshes = {index: _mesh(capture, rig, index) for index in indices}
-    has_masks = (capture.path / "masks").is_dir()
+    has_masks = capture.images.has_masks
     diagnosis = _diagnosis(capture, rig, meshes, minimum_iou) if has_masks else None
     sheet = out / f"{capture.path.resolve().name}.png"
     _draw_sheet(sheet, capture, rig, meshes, diagnosis)
@@ -206,7 +210,7 @@ def _camera_table(capture: Capture) -> Table:
     for name, camera in capture.cameras.items():
         position = " ".join(f"{value:.2f}" for value in camera.center_world)
         use = "held out" if name in capture.description.held_out_cameras else "training"
-        counts = [_count_and_bytes(capture.path / kind / name)[0] for kind in ("images", "masks")]
+        counts = [capture.images.amount(kind, name)[0] for kind in ("images", "masks")]
         table.add_row(name, f"{camera.width}x{camera.height}", f"{camera.fx:.1f}", f"{camera.fy:.1f}", position, use, *map(str, counts))
     return table
 
@@ -227,7 +231,7 @@ def _file_table(capture: Capture) -> Table:
     table = Table("part", "there", "size")
     expected = len(capture.cameras) * len(capture.frames)
     for kind in ("images", "masks"):
-        counts = [_count_and_bytes(capture.path / kind / name) for name in capture.cameras]
+        counts = [capture.images.amount(kind, name) for name in capture.cameras]
         count, size = sum(count for count, _ in counts), sum(size for _, size in counts)
         there = f"{count} of {expected}" if count else "missing"
         table.add_row(kind, there, decimal(size))
@@ -240,15 +244,6 @@ def _file_table(capture: Capture) -> Table:
         f"rig ({capture.description.rig})", "there" if has_rig else "missing", decimal(capture.rig_path.stat().st_size if has_rig else 0)
     )
     return table
-
-
-def _count_and_bytes(folder: Path) -> tuple[int, int]:
-    """Number and total size of the files in a folder; temporary files, whose names start with a dot, do not count."""
-    if not folder.is_dir():
-        return 0, 0
-    with os.scandir(folder) as entries:
-        sizes = [entry.stat().st_size for entry in entries if entry.is_file() and not entry.name.startswith(".")]
-    return len(sizes), sum(sizes)
 
 
 @interruptible("capture", kept="finished files are whole and kept. Give the same command again to write all of them.")

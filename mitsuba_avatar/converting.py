@@ -1,13 +1,9 @@
-"""`capture convert`: other formats into our layout, and our layout into Goliath's.
-
-The readers know files, the body stage knows rigs; here they meet.
-"""
+"""`capture convert`: other formats into our layout, and our layout into Goliath's."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,19 +12,18 @@ import tyro
 from jaxtyping import Float32
 from rich.console import Console
 
-from mitsuba_avatar.body.momentum_rig import face_signal, momentum_from_rig, momentum_poses, rig_from_momentum
-from mitsuba_avatar.body.rig import Rig, load_rig, save_rig
+from mitsuba_avatar.body.momentum_rig import momentum_from_rig, momentum_poses
+from mitsuba_avatar.body.rig import Rig, load_rig
 from mitsuba_avatar.body.skinning import posed_rest_surface
-from mitsuba_avatar.captures.arrays import open_frame_array
+from mitsuba_avatar.body.source_captures import capture_folder, convert_with_body, images_in_place
 from mitsuba_avatar.captures.cameras import UpAxis
+from mitsuba_avatar.captures.description import Distortion
 from mitsuba_avatar.captures.folder import Capture
-from mitsuba_avatar.captures.formats.conversion import ConversionOptions, convert, read_report, with_frames
-from mitsuba_avatar.captures.formats.goliath import GoliathSource
+from mitsuba_avatar.captures.formats.conversion import ConversionOptions, read_report, with_frames
 from mitsuba_avatar.captures.formats.goliath_writer import GoliathBody, write_goliath
 from mitsuba_avatar.captures.formats.opening import FormatName, open_source
 from mitsuba_avatar.captures.formats.source import Source, SourceOptions
 from mitsuba_avatar.captures.images import ImageExtension
-from mitsuba_avatar.captures.writer import CaptureWriter
 from mitsuba_avatar.progress import tracked
 from mitsuba_avatar.rendering.backend import select_variant
 
@@ -58,6 +53,7 @@ class ConvertCommand:
         distortion: Apply or ignore the stored lens coefficients; default: as the data set's own tools do.
         assets: Body model of Goliath captures (static_assets_body.pt or .npz); default: in or beside the capture.
         own_sizes: Keep the size of each camera's images; default: all become as small as the smallest.
+        in_place: Write everything but images and masks, which are then read, and straightened, where they lie; the source must stay there.
         links: Link to image files that need no change instead of copying them; the source must stay where it is.
         occlusion_size: Texels of the ambient occlusion maps written with --to goliath; 0 leaves them out.
     """
@@ -76,9 +72,10 @@ class ConvertCommand:
     fps: float = 0.0
     test_frames: int = -1
     up: UpAxis = "auto"
-    distortion: Literal["auto", "apply", "ignore"] = "auto"
+    distortion: Distortion = "auto"
     assets: Path | None = None
     own_sizes: bool = False
+    in_place: bool = False
     links: bool = False
     occlusion_size: int = 0
 
@@ -94,6 +91,8 @@ def run_conversion(command: ConvertCommand) -> None:
             f"convert(): expected --from FORMAT or --to goliath; got {command.from_format} and {command.to_format}. Give one of them."
         )
     if command.to_format is not None:
+        if command.in_place:
+            raise ValueError("convert(): expected --in-place with --from FORMAT; got it with --to goliath, which has its own layout.")
         _export(command)
     else:
         _import(command)
@@ -103,55 +102,21 @@ def _import(command: ConvertCommand) -> None:
     """Another format into ours."""
     options = SourceOptions(command.cameras, command.fps, command.test_frames, command.up, command.distortion, command.assets)
     source = with_frames(open_source(command.from_format, command.source, options), command.first_frame, command.last_frame)
-    body = _MomentumBody(source) if isinstance(source, GoliathSource) and source.tracking_is_there else None
     conversion = ConversionOptions(
         command.scale,
         command.held_out_cameras,
         command.image_extension,
         command.every,
-        writes_vertices=body is not None,
-        own_sizes=command.own_sizes,
+        own_sizes=command.own_sizes or command.in_place,
         links=command.links,
+        images_from=images_in_place(command.from_format, command.source, source, options) if command.in_place else None,
     )
-    capture = (
-        convert(source, command.destination, conversion, track=tracked)
-        if body is None
-        else convert(source, command.destination, conversion, body.add, tracked)
-    )
-    _print_summary(capture, source)
-
-
-class _MomentumBody:
-    """Adds the rig of a Goliath capture, its poses, and the face signal of its registered meshes."""
-
-    def __init__(self, source: GoliathSource):
-        self.source = source
-
-    def add(self, writer: CaptureWriter, indices: tuple[int, ...]) -> Sequence[str]:
-        """Write rig, poses and face; returns what the rig cannot do."""
-        tracking = self.source.tracking()
-        tracked = rig_from_momentum(tracking)
-        rows = list(indices)
-        theta, root = tracked.theta[rows], tracked.root[rows]
-        with TemporaryDirectory() as folder:
-            save_rig(Path(folder) / "rig.npz", tracked.rig)
-            writer.write_rig(Path(folder) / "rig.npz")
-        writer.write_arrays(theta=theta, root=root)
-        vertices = open_frame_array(writer.path, "vertices", len(rows))
-        if vertices is None:
-            return (*tracked.notes, "no registered meshes: no face signal, and model.use_latent must be false")
-        if vertices.shape[1] != tracked.rig.topology.num_vertices:
-            raise ValueError(
-                f"convert(): expected {tracked.rig.topology.num_vertices} registered vertices, those of {self.source.assets_path}; got "
-                f"{vertices.shape[1]}. Take model and capture of one release."
-            )
-        writer.write_arrays(face=face_signal(tracked.rig, theta, root, vertices))
-        return tracked.notes
+    _print_summary(convert_with_body(source, command.destination, conversion, tracked), source)
 
 
 def _export(command: ConvertCommand) -> None:
     """Ours into Goliath's."""
-    capture = Capture.open(command.source, command.scale)
+    capture = Capture.open(capture_folder(command.source, tracked), command.scale)
     body = None
     if capture.rig_path.is_file() and capture.theta is not None and capture.root is not None:
         rig = load_rig(capture.rig_path)
@@ -194,6 +159,8 @@ def _print_summary(capture: Capture, source: Source) -> None:
         console.print(text, highlight=False, soft_wrap=True, markup=False)
 
     say(f"Wrote {len(capture.cameras)} cameras and {len(capture.frames)} frames to {capture.path}.")
+    if capture.description.images_from is not None:
+        say(f"Images stay in {capture.description.images_from.path}, and are straightened when they are read.")
     if report["remapped_cameras"]:
         say(f"Undistorted or resized: images of {len(report['remapped_cameras'])} cameras.")
     for reason, count in source.info.missing_reasons().items():

@@ -117,24 +117,22 @@ class _Training:
         """From the run folder, or encoded now."""
         from mitsuba_avatar.driving.training_latents import training_latents
         from mitsuba_avatar.progress import progress_bar
-        from mitsuba_avatar.training.readiness import open_as_set
 
         with progress_bar("training latents", 1) as bar:
-            return training_latents(
-                self.run, self.avatar, lambda: open_as_set(self.run.capture_path, self.run.settings.capture), self.checkpoint, bar.update
-            )
+            return training_latents(self.run, self.avatar, self.run.open_capture, self.checkpoint, bar.update)
 
 
 def _signals(
     command: DriveCommand, run: "RunFolder", avatar: "Avatar", training: _Training
 ) -> tuple["AssembledDrive", "RangeReport | None"]:
     """What drives the avatar, brought into range."""
+    from mitsuba_avatar.body.source_captures import capture_folder
     from mitsuba_avatar.captures.folder import Capture
     from mitsuba_avatar.driving.assembly import assemble, trained_face
     from mitsuba_avatar.driving.limits import clamped, projected
     from mitsuba_avatar.driving.sources import load_body, load_face
 
-    pose = Path(command.pose) if command.pose else run.capture_path
+    pose = capture_folder(command.pose) if command.pose else run.open_capture().path
     body = load_body(pose, run.rig, command.fps, command.split, command.seconds)
     has_face = isinstance(body.capture, Capture) and body.capture.face is not None or (pose.is_dir() and (pose / "face.npy").is_file())
     source = command.face or (str(pose) if has_face else "")
@@ -209,6 +207,7 @@ def _draw(
     folder: Path,
 ) -> "FrameClock":
     """Decode, render, write."""
+    from mitsuba_avatar.body.source_captures import capture_folder
     from mitsuba_avatar.captures.folder import DESCRIPTION_FILE, Capture
     from mitsuba_avatar.driving.animation import FrameClock, animate, outline
     from mitsuba_avatar.loaded_run import avatar_occlusion
@@ -217,13 +216,12 @@ def _draw(
     from mitsuba_avatar.reporting.figures import Tile, compose, save_image
     from mitsuba_avatar.reporting.video import write_video
     from mitsuba_avatar.reporting.view_transform import ViewTransform, write_png
-    from mitsuba_avatar.training.readiness import open_as_set
 
     count, transform, clock = len(signals), ViewTransform(), FrameClock()
     capture = None
     if command.path == "held_out":  # of what drives, or of the run's capture where that has no cameras
-        has_cameras = bool(command.pose) and (Path(command.pose) / DESCRIPTION_FILE).is_file()
-        capture = Capture.open(command.pose) if has_cameras else open_as_set(run.capture_path, run.settings.capture)
+        driving = capture_folder(command.pose) if command.pose else None
+        capture = Capture.open(driving) if driving is not None and (driving / DESCRIPTION_FILE).is_file() else run.open_capture()
     cameras, turns = _cameras(command, capture, outline(avatar, signals), count)
     signals = signals.turned(turns)
     samples = command.samples or run.settings.evaluation.samples_per_pixel

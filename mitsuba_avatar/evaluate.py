@@ -21,7 +21,7 @@ class EvaluateCommand:
     """Measure a run's avatar against its capture."""
 
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
-    capture: str = ""  # another capture of the same rig; default: the one it was trained on
+    capture: str = ""  # another capture of the same rig, a folder or FORMAT:DIR; default: the one it was trained on
     frames: int = 0  # frames per split; default: the run's setting evaluation.frames_per_split
     checkpoint: str = "last"  # best or last
     out: str = ""  # where metrics go; default: RUN/metrics.json; the pictures' CSV lies beside it

@@ -38,7 +38,7 @@ class ExportCommand:
     texture: Literal["radiance", "albedo"] = "radiance"  # of all but ply: as captured, or to be lit
     captured_light: str = "auto"  # divided out for albedo: auto (the capture's own), uniform, or a scene
     validate: bool = False  # glb: also run the Khronos validator (node and the npm package gltf-validator)
-    capture: str = ""  # driving capture of the same rig; default: the run's
+    capture: str = ""  # driving capture of the same rig, a folder or FORMAT:DIR; default: the run's
     checkpoint: str = "last"  # best or last
     out: str = ""  # folder; default: RUN/export
     variant: str = "auto"  # Mitsuba variant

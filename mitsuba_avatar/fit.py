@@ -19,6 +19,7 @@ from typing import Annotated  # noqa: E402
 
 import tyro  # noqa: E402
 
+from mitsuba_avatar.captures.formats.opening import SourceName  # noqa: E402
 from mitsuba_avatar.command_line import interruptible, parse_command  # noqa: E402
 from mitsuba_avatar.presets import resolve  # noqa: E402
 from mitsuba_avatar.rendering import backend  # noqa: E402
@@ -30,7 +31,7 @@ class FitCommand:
     """Fit an avatar to a capture by differentiable rendering."""
 
     config: str = "default"  # preset of configs/, or a YAML file
-    capture: str = ""  # capture folder; default: the setting capture.path, else the embedded capture
+    capture: str = ""  # capture folder, or FORMAT:DIR (docs/data_sets.md); default: the setting capture.path, else the embedded capture
     # torchrun's own parser stumbles over --run on its way here (Python 3.11 and older), hence the second name.
     run: Annotated[str, tyro.conf.arg(aliases=("--run-folder",))] = ""  # run folder; default: runs/<config>, numbered if taken
     resume: bool = False  # continue the run
@@ -58,7 +59,7 @@ def _resolved(command: FitCommand, overrides: list[str]) -> Settings:
             raise FileNotFoundError(f"fit(): expected a run to resume with {preset}; got none. Name its folder with --run.")
     if command.capture:
         # Absolute, so that the run can be resumed from another folder.
-        overrides = [*overrides, f"capture.path={Path(command.capture).absolute()}"]
+        overrides = [*overrides, f"capture.path={SourceName.parse(command.capture) or Path(command.capture).absolute()}"]
     if command.variant:
         overrides = [*overrides, f"rendering.variant={command.variant}"]
     return resolve(preset, overrides)

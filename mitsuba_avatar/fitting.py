@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from mitsuba_avatar.body.rig import Rig, load_rig
+from mitsuba_avatar.body.source_captures import capture_folder
 from mitsuba_avatar.captures.checks import check_values
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.driving.animation import FrameClock, animate, outline
@@ -23,7 +24,7 @@ from mitsuba_avatar.filming.film import default_capture_path, film_capture
 from mitsuba_avatar.filming.settings import StudioSettings
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.presets import resolve
-from mitsuba_avatar.progress import StageProgress, progress_bar
+from mitsuba_avatar.progress import StageProgress, progress_bar, tracked
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion, FrameOcclusion
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.reporting.camera_paths import orbit
@@ -53,6 +54,8 @@ def open_capture(settings: Settings, process: Process = Process()) -> Capture:  
         FileNotFoundError, ValueError: the capture is missing, unfinished or unusable; the message names file and remedy.
     """
     if settings.capture.path:
+        if process.is_main:
+            capture_folder(settings.capture.path, tracked)  # a data set of another format takes a while, once
         capture = open_as_set(settings.capture.path, settings.capture)
     else:
         studio = resolve("studio/default", kind=StudioSettings)

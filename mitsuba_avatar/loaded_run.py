@@ -29,7 +29,7 @@ class LoadedRun:
 
         Args:
             path: run folder.
-            capture_path: capture that drives and judges it; empty for the one it was trained on.
+            capture_path: capture that drives and judges it, a folder or FORMAT:DIR; empty for the one it was trained on.
             checkpoint: "best" or "last".
 
         Raises:
@@ -39,7 +39,7 @@ class LoadedRun:
         if checkpoint not in ("best", "last"):
             raise ValueError(f"LoadedRun.open(): expected checkpoint 'best' or 'last'; got {checkpoint!r}.")
         run = RunFolder.open(path)
-        capture = open_as_set(capture_path or run.capture_path, run.settings.capture)
+        capture = open_as_set(capture_path, run.settings.capture) if capture_path else run.open_capture()
         rig = load_rig(capture.rig_path)
         run.check_capture(capture, rig)
         check_driving(capture)
@@ -54,7 +54,7 @@ class LoadedRun:
         """
         if self.capture.path.resolve() == self.run.capture_path.resolve():
             return self.capture
-        return open_as_set(self.run.capture_path, self.run.settings.capture)
+        return self.run.open_capture()
 
     def occlusion(self) -> AmbientOcclusion:
         """Baker of occlusion maps at the size that the avatar reads."""

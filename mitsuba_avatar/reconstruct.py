@@ -35,7 +35,7 @@ class ReconstructCommand:
     """Reconstruct frames of a capture with a run's avatar."""
 
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit wrote
-    capture: str = ""  # another capture of the same rig; default: the one it was trained on
+    capture: str = ""  # another capture of the same rig, a folder or FORMAT:DIR; default: the one it was trained on
     split: Literal["test", "train", "stress"] = "test"
     first: int | None = None  # number of the first frame; default: the split's
     frames: int = 8  # how many; 0: all from the first on

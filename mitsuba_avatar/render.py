@@ -44,7 +44,7 @@ class RenderCommand:
     play: int | None = None  # drive with consecutive frames of the capture from this one (number) on
     width: int = 360  # pixels; held-out cameras and cameras of a file keep their size
     height: int = 540
-    capture: str = ""  # driving capture of the same rig; default: the run's
+    capture: str = ""  # driving capture of the same rig, a folder or FORMAT:DIR; default: the run's
     checkpoint: str = "last"  # best or last
     scene: str = ""  # path-trace in this scene: a name in scenes/ or an XML file
     light: Literal["relit", "baked"] = "relit"  # in a scene: lit by its lamps, or glowing as captured

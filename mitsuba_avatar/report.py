@@ -28,7 +28,7 @@ class ReportCommand:
     views: int = 4  # of the comparison
     frames: int = 4  # frames per split that are measured where a run has no metrics.csv
     measure: bool = False  # measure anew, whatever there is
-    capture: str = ""  # another capture of the same rig; default: the one each run was trained on
+    capture: str = ""  # another capture of the same rig, a folder or FORMAT:DIR; default: the one each run was trained on
     checkpoint: str = "last"  # best or last
     variant: str = "auto"  # Mitsuba variant
 

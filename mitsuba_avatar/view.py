@@ -29,7 +29,7 @@ class ViewCommand:
     host: str = "127.0.0.1"  # address to listen on; 0.0.0.0 lets other machines in
     height: int = 480  # of the pictures; the width follows the window
     measure: float = 0.0  # seconds to draw for without a browser, to print the rate; 0 serves the viewer
-    capture: str = ""  # another capture of the same rig; default: the run's
+    capture: str = ""  # another capture of the same rig, a folder or FORMAT:DIR; default: the run's
     checkpoint: str = "last"  # best or last
     variant: str = "auto"  # Mitsuba variant
 

@@ -180,6 +180,25 @@ def test_a_capture_goes_to_goliath_and_back_and_passes_the_check(whole, tmp_path
     assert load_rig(back.rig_path).dofs.names == load_rig(original.rig_path).dofs.names
 
 
+def test_a_goliath_capture_is_described_checked_and_converted_in_place(whole, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("MITSUBA_AVATAR_CACHE", str(tmp_path / "cache"))
+    exported = tmp_path / BODY_FOLDER
+    assert main(["convert", "--to", "goliath", str(whole), str(exported)]) == 0
+    zips = sorted(exported.rglob("*"))
+    assert main(["info", f"goliath:{exported}"]) == 0
+    text = capsys.readouterr().out
+    assert f"read in place from goliath:{exported}" in text and "12 of 12" in text and "theta (pose.npy)" in text
+    assert main(["check", f"goliath:{exported}", "--minimum-iou", "0.95", "--out", str(tmp_path / "sheets")]) == 0
+    assert "The capture is fine" in capsys.readouterr().out
+    assert main(["convert", "--from", "goliath", "--in-place", "--every", "2", str(exported), str(tmp_path / "own")]) == 0
+    assert f"Images stay in {exported}" in capsys.readouterr().out
+    capture = Capture.open(tmp_path / "own", image_scale=0.5)
+    assert len(capture.frames) == 2 and capture.theta is not None and capture.image("left", 1).shape == (24, 32, 3)
+    assert not list((tmp_path / "own").rglob("*.avif")) and sorted(exported.rglob("*")) == zips
+    assert main(["info", f"golliath:{exported}"]) == 1
+    assert "FORMAT one of goliath, actorshq" in capsys.readouterr().err
+
+
 def test_converting_without_a_body_says_what_is_missing(tmp_path, capsys):
     (tmp_path / "data").mkdir()
     write_thuman4(tmp_path / "data")
@@ -197,6 +216,7 @@ def test_converting_without_a_body_says_what_is_missing(tmp_path, capsys):
         (["--from", "zju"], "expected a file at"),
         (["--from", "actorshq", "--up", "x"], "calibration.csv; got none"),
         (["--to", "goliath"], "expected a folder name with 'Body'"),
+        (["--to", "goliath", "--in-place"], "expected --in-place with --from FORMAT"),
     ],
 )
 def test_conversions_that_cannot_be_are_named(whole, tmp_path, capsys, words, message):

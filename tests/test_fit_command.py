@@ -14,8 +14,14 @@ import pytest
 import yaml
 from PIL import Image
 
+from mitsuba_avatar.body.momentum_rig import momentum_from_rig, momentum_poses
+from mitsuba_avatar.body.rig import load_rig
+from mitsuba_avatar.captures.formats.goliath_writer import GoliathBody, write_goliath
 from mitsuba_avatar.captures.images import image_size
+from mitsuba_avatar.drive import main as drive
+from mitsuba_avatar.evaluate import main as evaluate
 from mitsuba_avatar.fit import main
+from mitsuba_avatar.presets import load_settings
 from mitsuba_avatar.reporting.evaluation import METHODS
 from mitsuba_avatar.reporting.metrics import load_metrics, read_records
 from mitsuba_avatar.training.run_folder import RunFolder
@@ -38,6 +44,26 @@ def fit(capture: Path | str, run: Path, *words: str) -> int:
 
 
 # ---- what a fit does
+
+
+@pytest.mark.slow  # about ten seconds: a fit, and two commands with its avatar
+def test_a_goliath_capture_is_fitted_evaluated_and_driven_where_it_lies(drawn_capture, tmp_path, private_cache, one_thread):
+    """Zips in, avatar out: no image is written but the run's own, and a cache that was emptied fills itself again."""
+    exported = tmp_path / "s--20260101--0000--TST001--pilot--ProjectGoliath--ClothedBody--3cams"
+    rig = load_rig(drawn_capture.rig_path)
+    poses = momentum_poses(np.array(drawn_capture.theta), np.array(drawn_capture.root))
+    write_goliath(drawn_capture, exported, GoliathBody(momentum_from_rig(rig), poses))
+    held_out = drawn_capture.camera_names(held_out=True)
+    words = (f"capture.held_out_cameras={','.join(held_out)}", *SHORTEST_FIT)
+    assert fit(f"goliath:{exported}", tmp_path / "run", *words) == 0
+    assert load_settings(tmp_path / "run/settings.yaml").capture.path == f"goliath:{exported}"
+    in_cache = list((private_cache / "in_place").rglob("capture.yaml"))
+    assert len(in_cache) == 1 and not (in_cache[0].parent / "images").exists()
+    shutil.rmtree(private_cache / "in_place")
+    assert evaluate([str(tmp_path / "run"), "--frames", "1", "--no-flip", "--flicker-frames", "0"]) == 0
+    assert load_metrics(tmp_path / "run/metrics.json")["avatar"]["test"]["held_out"]["images"] == len(held_out)
+    assert drive([str(tmp_path / "run"), "--pose", f"goliath:{exported}", "--path", "front", "--format", "png"]) == 0
+    assert main(["--run", str(tmp_path / "run"), "--resume", "training.iterations=3"]) == 0
 
 
 def test_a_short_fit_reduces_the_error_of_held_out_cameras(fitted_run):
@@ -254,7 +280,7 @@ BAD_CAPTURES = {
     "missing pose": (lambda folder: (folder / "pose.npy").unlink(), ["pose.npy", "got none", "add the files"]),
     "missing masks": (lambda folder: shutil.rmtree(folder / "masks"), ["/masks", "got none", "Segment"]),
     "missing vertices": (lambda folder: (folder / "vertices.npy").unlink(), ["vertices.npy", "got none", "model.use_latent false"]),
-    "unfinished": (lambda folder: (folder / "capture.yaml").unlink(), ["capture.yaml", "got no capture.yaml", "convert the data set"]),
+    "unfinished": (lambda folder: (folder / "capture.yaml").unlink(), ["capture.yaml", "got no capture.yaml", "or a data set as FORMAT:DIR"]),
 }
 
 

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float32
 
 from mitsuba_avatar.captures.arrays import FRAME_ARRAYS
 from mitsuba_avatar.captures.folder import Capture
-from mitsuba_avatar.captures.images import image_size, is_complete, read_mask
 from mitsuba_avatar.captures.rigid import is_rigid
 
 BLOCK_BYTES = 1 << 24  # arrays are read in blocks of this size, so that memory does not grow with the number of frames
@@ -72,28 +71,14 @@ def check_images(capture: Capture, frame_indices: Iterable[int]) -> None:
         FileNotFoundError: for a missing file.
         ValueError: for a truncated file, a wrong size, or a mask of labels. Names file, expectation and remedy.
     """
-    has_masks = (capture.path / "masks").is_dir()
+    capture.images.require()
     for index in frame_indices:
+        number = capture.frames[index].number
         for name in capture.cameras:
-            _check_image_file(capture, name, capture.image_path(name, index))
-            if has_masks:
-                path = capture.mask_path(name, index)
-                _check_image_file(capture, name, path)
-                if int(read_mask(path).max()) == 1:
-                    raise ValueError(f"check_images(): expected a mask from 0 to 255 in {path}; got labels 0 and 1. Multiply by 255.")
-
-
-def _check_image_file(capture: Capture, camera_name: str, path: Path) -> None:
-    """Existence, size and end of one file."""
-    size = image_size(path)
-    camera = capture.stored_camera(camera_name)
-    if size != (camera.width, camera.height):
-        raise ValueError(
-            f"check_images(): expected {camera.width}x{camera.height} pixels, the size of {camera_name} in cameras.json, in {path}; "
-            f"got {size[0]}x{size[1]}. Export it at the camera's size, or correct the camera."
-        )
-    if not is_complete(path):
-        raise ValueError(f"check_images(): expected a whole image in {path}; got a truncated one. Copy or export it again.")
+            camera = capture.stored_camera(name)
+            capture.images.check_image(camera, number)
+            if capture.images.has_masks:
+                capture.images.check_mask(camera, number)
 
 
 def _check_width(capture: Capture, name: str, array: Float32[np.ndarray, "N *row"] | None, expected: int, of_what: str) -> None:

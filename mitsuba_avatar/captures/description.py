@@ -10,16 +10,41 @@ from typing import Any, Literal
 
 import yaml
 
+from mitsuba_avatar.captures.cameras import UpAxis
 from mitsuba_avatar.captures.colour import ColourCurve
 from mitsuba_avatar.captures.images import ImageExtension
 from mitsuba_avatar.files import atomic_path
 
 FORMAT_VERSION = 1
+Distortion = Literal["auto", "apply", "ignore"]
 CHOICE_REMEDIES = {
     "colour_curve": "Encode the images with one of these curves.",
     "face_signal": "Say what face.npy holds.",
     "image_extension": "Convert the images.",
+    "up": "Name the axis of the data set's world that points up.",
+    "distortion": "Say what to do with stored lens coefficients.",
 }
+
+
+@dataclass(frozen=True)
+class ImagesFrom:
+    """The data set of another format that a capture's images, masks and plates are read from, straightened on reading.
+
+    Attributes:
+        format: of the data set; captures/formats/opening.py knows them.
+        path: its folder.
+        state: fingerprint of its files when the capture was made (captures/formats/source_state.py); empty is not compared.
+        has_masks: whether it has masks.
+        up: axis of its world that points up, as it was opened; "auto" asks its cameras.
+        distortion: whether stored lens coefficients are applied.
+    """
+
+    format: str
+    path: str
+    state: str = ""
+    has_masks: bool = True
+    up: UpAxis = "auto"
+    distortion: Distortion = "auto"
 
 
 @dataclass(frozen=True)
@@ -42,6 +67,7 @@ class CaptureDescription:
         keypoint_names: name of each keypoint of keypoints.npy; empty if unnamed.
         held_out_cameras: cameras that no training may look at.
         image_extension: of the image files.
+        images_from: where images lie that are not in this folder; None where they are.
         licence: under which the capture may be used.
         source: where it comes from.
 
@@ -63,6 +89,7 @@ class CaptureDescription:
     keypoint_names: tuple[str, ...] = ()
     held_out_cameras: tuple[str, ...] = ()
     image_extension: ImageExtension = "png"
+    images_from: ImagesFrom | None = None
     licence: str = ""
     source: str = ""
 
@@ -92,6 +119,8 @@ def description_text(description: CaptureDescription) -> str:
     """The text of capture.yaml: equal descriptions give equal text."""
     # Tuples as lists: YAML has no plain notation for tuples.
     values = {key: list(value) if isinstance(value, tuple) else value for key, value in dataclasses.asdict(description).items()}
+    if description.images_from is None:
+        del values["images_from"]
     return yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
 
 
@@ -110,26 +139,35 @@ def load_description(path: Path | str) -> CaptureDescription:
         document = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"load_description(): expected YAML in {path}; got: {error}. Repair the file.") from error
-    known = [entry.name for entry in dataclasses.fields(CaptureDescription)]
     if not isinstance(document, dict) or not {"name", "fps"} <= set(document):
         raise ValueError(f"load_description(): expected the keys 'name' and 'fps' in {path}; got {document!r}. Add them.")
-    for key in document:
-        if key not in known:
-            nearest = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)[0]
-            raise ValueError(f"load_description(): expected known keys in {path}; got {key!r}. Did you mean {nearest!r}?")
     try:
-        return CaptureDescription(**{key: _typed(key, value) for key, value in document.items()})
+        return _built(CaptureDescription, document)
     except ValueError as error:
         raise ValueError(f"load_description(): {path} is not usable. {error}") from error
 
 
-def _typed(key: str, value: Any) -> Any:
+def _built(kind: type, document: dict) -> Any:
+    """A dataclass of the file's mapping; unknown keys are refused."""
+    known = [entry.name for entry in dataclasses.fields(kind)]
+    for key in document:
+        if key not in known:
+            nearest = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)[0]
+            raise ValueError(f"Expected known keys; got {key!r}. Did you mean {nearest!r}?")
+    return kind(**{key: _typed(kind, key, value) for key, value in document.items()})
+
+
+def _typed(owner: type, key: str, value: Any) -> Any:
     """A value of the file in the type of its field: YAML reads `name: 2024` as a number and `fps: fast` as text."""
     if key == "background":
         if value is not None and (not isinstance(value, list) or len(value) != 3 or not all(_is_radiance(part) for part in value)):
             raise ValueError(f"Expected background to be three numbers >= 0, linear radiance; got {value!r}. Leave it out if unknown.")
         return None if value is None else tuple(float(part) for part in value)
-    kind = typing.get_type_hints(CaptureDescription)[key]
+    if key == "images_from":
+        if not isinstance(value, dict) or not {"format", "path"} <= set(value):
+            raise ValueError(f"Expected images_from with format and path; got {value!r}. `capture convert --in-place` writes it.")
+        return _built(ImagesFrom, value)
+    kind = typing.get_type_hints(owner)[key]
     if typing.get_origin(kind) is Literal:
         choices = typing.get_args(kind)
         if value not in choices:
@@ -139,6 +177,10 @@ def _typed(key: str, value: Any) -> Any:
         if not isinstance(value, list):
             raise ValueError(f"Expected {key} to be a list of names; got {value!r}. Write one name a line, each after a dash.")
         return tuple(str(name) for name in value)
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise ValueError(f"Expected {key} to be true or false; got {value!r}. Write one of them.")
+        return value
     if kind in (int, float):
         if isinstance(value, bool) or not isinstance(value, int | kind) or not math.isfinite(value):
             raise ValueError(f"Expected {key} to be a number; got {value!r}. Write it without quotes and units.")

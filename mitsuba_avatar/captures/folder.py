@@ -12,36 +12,32 @@ rig.npz           body/rig.py; this package only knows where it lies
 
 Opening reads the three small text files and the headers of the arrays. Images are decoded when asked for and never kept, arrays are
 memory-mapped: memory does not grow with the number of frames. Missing pieces are None or a FileNotFoundError that names them.
+
+Where capture.yaml has `images_from`, images, masks and plates stay in a data set of another format and are read there
+(captures/formats/in_place.py); everything else lies here.
 """
 
 import difflib
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from PIL import Image
 
 from mitsuba_avatar.captures.arrays import FRAME_ARRAYS, open_frame_array
 from mitsuba_avatar.captures.cameras import Camera, load_cameras
-from mitsuba_avatar.captures.colour import decode, decode_bytes, encode
+from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.captures.description import CaptureDescription, load_description
+from mitsuba_avatar.captures.formats.in_place import SourceImages
+from mitsuba_avatar.captures.formats.opening import FORMAT_NAMES
 from mitsuba_avatar.captures.frames import Frame, load_frames
-from mitsuba_avatar.captures.images import EncodedImage, read_image, read_mask
+from mitsuba_avatar.captures.image_store import FolderImages, ImageStore, decoded
+from mitsuba_avatar.captures.images import EncodedImage
 
 DESCRIPTION_FILE = "capture.yaml"
 UNFINISHED_FILE = "capture.unfinished.yaml"
 CAMERAS_FILE = "cameras.json"
 FRAMES_FILE = "frames.csv"
-
-
-def image_path(folder: Path, camera_name: str, frame_number: int, extension: str) -> Path:
-    """Where an image lies; by frame number, not index."""
-    return folder / "images" / camera_name / f"{frame_number:06d}.{extension}"
-
-
-def mask_path(folder: Path, camera_name: str, frame_number: int) -> Path:
-    """Where a mask lies; by frame number, not index."""
-    return folder / "masks" / camera_name / f"{frame_number:06d}.png"
 
 
 class Capture:
@@ -53,6 +49,7 @@ class Capture:
         cameras: name -> Camera, at the size that `image` returns.
         frames: by index.
         image_scale: factor by which images and cameras are resampled on reading.
+        images: where images, masks and plates come from.
         theta, root, face, keypoints, vertices: [N, ...] float32, memory-mapped, None where the capture has none; see captures/arrays.py.
     """
 
@@ -66,6 +63,9 @@ class Capture:
         self.frames = frames
         self.image_scale = image_scale
         self._stored_cameras = cameras
+        self.images: ImageStore = FolderImages(path, description.image_extension)
+        if description.images_from is not None:
+            self.images = SourceImages(path, description, cameras)
         self.theta = open_frame_array(path, "theta", len(frames))
         self.root = open_frame_array(path, "root", len(frames))
         self.face = open_frame_array(path, "face", len(frames))
@@ -104,16 +104,6 @@ class Capture:
         """Where the rig lies, or would lie: the capture may have none."""
         return self.path / self.description.rig
 
-    def image_path(self, camera_name: str, frame_index: int) -> Path:
-        """File of an image, present or not."""
-        return image_path(
-            self.path, self.stored_camera(camera_name).name, self._frame(frame_index).number, self.description.image_extension
-        )
-
-    def mask_path(self, camera_name: str, frame_index: int) -> Path:
-        """File of a mask, present or not."""
-        return mask_path(self.path, self.stored_camera(camera_name).name, self._frame(frame_index).number)
-
     def encoded_image(self, camera_name: str, frame_index: int) -> EncodedImage:
         """Decode an image file: [H, W, 3] as stored and at stored size, uint8 or, for exr, float32.
 
@@ -121,30 +111,25 @@ class Capture:
             FileNotFoundError: if the image is missing.
             ValueError: if the file is truncated or its size is not the camera's.
         """
-        path = self.image_path(camera_name, frame_index)
-        pixels = read_image(path)
-        self._check_size(path, camera_name, pixels.shape)
-        return pixels
+        return self.images.image(self.stored_camera(camera_name), self._frame(frame_index).number)
 
     def image(self, camera_name: str, frame_index: int) -> Float32[np.ndarray, "H W 3"]:
         """Linear values of an image [H, W, 3], where 1 is the file's white; at the size of `cameras`. Raises as `encoded_image`."""
-        return self._linear(self.encoded_image(camera_name, frame_index), camera_name)
+        linear = self.images.linear(self.stored_camera(camera_name), self._frame(frame_index).number, self.description.colour_curve)
+        return self._resampled(linear, camera_name)
 
     def display_image(self, camera_name: str, frame_index: int) -> Float32[np.ndarray, "H W 3"]:
         """Display-encoded (sRGB) values of an image [H, W, 3], at the size of `cameras`; as stored, where the file holds just that.
 
         Raises as `encoded_image`.
         """
-        stored = self.encoded_image(camera_name, frame_index)
         if self.description.colour_curve == "srgb" and self.image_scale == 1.0:
-            return stored.astype(np.float32) / np.float32(255.0)
-        return encode(self._linear(stored, camera_name), "srgb")
+            return self.encoded_image(camera_name, frame_index).astype(np.float32) / np.float32(255.0)
+        return encode(self.image(camera_name, frame_index), "srgb")
 
     def mask(self, camera_name: str, frame_index: int) -> Float32[np.ndarray, "H W"]:
         """Coverage of the person [H, W], 0 background to 1 person; at the size of `cameras`. Raises as `encoded_image`."""
-        path = self.mask_path(camera_name, frame_index)
-        stored: UInt8[np.ndarray, "h w"] = read_mask(path)
-        self._check_size(path, camera_name, stored.shape)
+        stored = self.images.mask(self.stored_camera(camera_name), self._frame(frame_index).number)
         return self._resampled((stored.astype(np.float32) / np.float32(255.0))[..., None], camera_name)[..., 0]
 
     def background(self, camera_name: str) -> Float32[np.ndarray, "H W 3"] | None:
@@ -154,11 +139,9 @@ class Capture:
             ValueError: if the plate is truncated or its size is not the camera's.
         """
         camera = self.cameras[self.stored_camera(camera_name).name]
-        path = self.path / "backgrounds" / f"{camera_name}.{self.description.image_extension}"
-        if path.is_file():
-            plate = read_image(path)
-            self._check_size(path, camera_name, plate.shape)
-            return self._linear(plate, camera_name)
+        plate = self.images.background(self.stored_camera(camera_name))
+        if plate is not None:
+            return self._resampled(decoded(plate, self.description.colour_curve), camera_name)
         if self.description.background is None:
             return None
         return np.broadcast_to(np.array(self.description.background, np.float32), (camera.height, camera.width, 3))
@@ -203,20 +186,6 @@ class Capture:
             )
         return self.frames[index]
 
-    def _check_size(self, path: Path, camera_name: str, shape: tuple[int, ...]) -> None:
-        """Refuse an image whose size is not its camera's."""
-        camera = self.stored_camera(camera_name)
-        if shape[:2] != (camera.height, camera.width):
-            raise ValueError(
-                f"Capture: expected {camera.width}x{camera.height} pixels, the size of {camera_name} in cameras.json, in {path}; got "
-                f"{shape[1]}x{shape[0]}. Store the camera at the images' size (Camera.resized scales the intrinsics)."
-            )
-
-    def _linear(self, pixels: EncodedImage, camera_name: str) -> Float32[np.ndarray, "h w 3"]:
-        """Pixels of a file as linear values at the size of `cameras`."""
-        curve = self.description.colour_curve
-        return self._resampled(decode_bytes(pixels, curve) if pixels.dtype == np.uint8 else decode(pixels, curve), camera_name)
-
     def _resampled(self, pixels: Float32[np.ndarray, "h w C"], camera_name: str) -> Float32[np.ndarray, "H W C"]:
         """Average pixels over the area of the larger ones."""
         if self.image_scale == 1.0:
@@ -254,5 +223,5 @@ def _why_not_a_capture(path: Path) -> str:
         )
     return (
         f"Capture.open(): expected {DESCRIPTION_FILE}, {CAMERAS_FILE} and {FRAMES_FILE} in {path}; got no {DESCRIPTION_FILE}. "
-        "Name a folder in the neutral layout, or convert the data set first."
+        f"Name a folder in this layout, or a data set as FORMAT:DIR, FORMAT one of {', '.join(FORMAT_NAMES)}."
     )

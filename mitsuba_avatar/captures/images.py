@@ -3,6 +3,7 @@
 Every complaint names the file. `is_complete` finds truncated files from a few bytes, so that thousands can be checked in seconds.
 """
 
+import io
 import struct
 from pathlib import Path
 from typing import Literal
@@ -101,14 +102,25 @@ def is_complete(path: Path | str) -> bool:
             return False
         return True
     with path.open("rb") as file:
-        size = file.seek(0, 2)
-        if path.suffix == ".avif":
-            return _boxes_fill_file(file, size)
-        tail_length = min(size, 64)
-        file.seek(size - tail_length)
-        tail = file.read(tail_length)
+        return _ends_well(file)
+
+
+def is_whole(data: bytes) -> bool:
+    """`is_complete` of the contents of a png, jpg or avif."""
+    return _ends_well(io.BytesIO(data))
+
+
+def _ends_well(file: io.BufferedIOBase) -> bool:
+    """Whether a png, jpg or avif, told by its first bytes, ends as it must."""
+    signature = file.read(12)
+    size = file.seek(0, 2)
+    if signature[4:8] == b"ftyp":
+        return _boxes_fill_file(file, size)
+    tail_length = min(size, 64)
+    file.seek(size - tail_length)
+    tail = file.read(tail_length)
     # PNG ends with its IEND chunk; JPEG with an end-of-image marker, after which some cameras pad.
-    return tail[-8:-4] == b"IEND" if path.suffix == ".png" else b"\xff\xd9" in tail
+    return tail[-8:-4] == b"IEND" if signature.startswith(PNG_SIGNATURE) else b"\xff\xd9" in tail
 
 
 def require_eight_bits(image: Image.Image, header: bytes, where: Path | str, caller: str) -> None:
@@ -130,7 +142,7 @@ def require_eight_bits(image: Image.Image, header: bytes, where: Path | str, cal
         )
 
 
-def _boxes_fill_file(file, size: int) -> bool:
+def _boxes_fill_file(file: io.BufferedIOBase, size: int) -> bool:
     """Walk the top-level boxes of an ISO base media file (ISO/IEC 14496-12): they must end exactly at the file's end."""
     position = 0
     while position < size:

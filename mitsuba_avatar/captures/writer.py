@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 from mitsuba_avatar.captures.arrays import save_frame_array
 from mitsuba_avatar.captures.cameras import Camera, cameras_text
 from mitsuba_avatar.captures.description import CaptureDescription, description_text
-from mitsuba_avatar.captures.folder import CAMERAS_FILE, DESCRIPTION_FILE, FRAMES_FILE, UNFINISHED_FILE, Capture, image_path, mask_path
+from mitsuba_avatar.captures.folder import CAMERAS_FILE, DESCRIPTION_FILE, FRAMES_FILE, UNFINISHED_FILE, Capture
 from mitsuba_avatar.captures.frames import Frame, frames_text
+from mitsuba_avatar.captures.image_store import MASKS_FOLDER, image_path, mask_path
 from mitsuba_avatar.captures.images import EncodedImage, write_image, write_mask
 from mitsuba_avatar.files import atomic_path
 
@@ -95,6 +96,8 @@ class CaptureWriter:
     def finish(self) -> Capture:
         """Declare the capture whole: check that every image is there, and every mask if there is any, then put capture.yaml in place.
 
+        Images that are read in place must be found where `images_from` says.
+
         Returns:
             the capture, opened.
 
@@ -102,10 +105,12 @@ class CaptureWriter:
             FileNotFoundError: if images or masks are missing; names the first.
             ValueError: if the reader would refuse what was written; the capture stays unfinished.
         """
-        self._require_all([self._image_path(name, index) for name in self.cameras for index in range(len(self.frames))], "images")
-        if (self.path / "masks").is_dir():
-            self._require_all([self._mask_path(name, index) for name in self.cameras for index in range(len(self.frames))], "masks")
-        Capture(self.path, self.description, self.cameras, self.frames)  # checks the arrays against frames and names
+        if self.description.images_from is None:
+            self._require_all([self._image_path(name, index) for name in self.cameras for index in range(len(self.frames))], "images")
+            if (self.path / MASKS_FOLDER).is_dir():
+                self._require_all([self._mask_path(name, index) for name in self.cameras for index in range(len(self.frames))], "masks")
+        capture = Capture(self.path, self.description, self.cameras, self.frames)  # checks the arrays against frames and names
+        capture.images.require()
         os.replace(self.path / UNFINISHED_FILE, self.path / DESCRIPTION_FILE)
         return Capture.open(self.path)
 

@@ -2,7 +2,7 @@
 
 | file | body | face |
 |---|---|---|
-| a capture's folder | its pose and root | its face signal, landmarks or action codes |
+| a capture's folder, or FORMAT:DIR | its pose and root | its face signal, landmarks or action codes |
 | a folder with theta.npy or pose.npy, root.npy, face.npy | the first two | the third |
 | .npy | [N, D] pose angles, with root.npy beside it if there is one | [N, F] as trained, or [N, A] action codes |
 | .bvh | retargeted | |
@@ -25,6 +25,7 @@ from mitsuba_avatar.body.driving import face_keypoints
 from mitsuba_avatar.body.rig import Rig, load_rig
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.body.skinning import pose_vertices
+from mitsuba_avatar.body.source_captures import capture_folder
 from mitsuba_avatar.captures.folder import DESCRIPTION_FILE, Capture
 from mitsuba_avatar.driving.face_signals import FaceKind
 from mitsuba_avatar.driving.signals import consecutive_runs
@@ -85,7 +86,7 @@ def load_body(path: Path | str, rig: Rig, fps: float = 0.0, split: str = "test",
         FileNotFoundError: there is no such file.
         ValueError: the file holds no motion, or not one of this rig.
     """
-    path = Path(path)
+    path = capture_folder(path)
     if (path / DESCRIPTION_FILE).is_file():
         track = _body_of_capture(path, rig, split)
     elif path.suffix.lower() == ".bvh":
@@ -118,7 +119,7 @@ def load_face(path: Path | str, wanted: FaceKind, fps: float, split: str = "test
         FileNotFoundError: there is no such file.
         ValueError: the file holds no face signal.
     """
-    path = Path(path)
+    path = capture_folder(path)
     if (path / DESCRIPTION_FILE).is_file():
         capture = Capture.open(path)
         if capture.face is None:

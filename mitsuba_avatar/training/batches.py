@@ -171,10 +171,11 @@ def check_readable(capture: Capture) -> None:
         ValueError: a camera is distorted.
     """
     check_driving(capture)
-    if not (capture.path / "masks").is_dir():
+    if not capture.images.has_masks:
         raise FileNotFoundError(
-            f"check_readable(): expected masks in {capture.path / 'masks'}; got none. Segment the person in every image first."
+            f"check_readable(): expected masks in {capture.images.masks_place}; got none. Segment the person in every image first."
         )
+    capture.images.require()
     distorted = [name for name, camera in capture.cameras.items() if camera.is_distorted]
     if distorted:
         raise ValueError(

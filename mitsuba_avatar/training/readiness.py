@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from mitsuba_avatar.body.source_captures import capture_folder
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.settings import CaptureSettings, Settings
 from mitsuba_avatar.training.batches import check_readable, training_sampler
@@ -13,13 +14,13 @@ def open_as_set(path: Path | str, settings: CaptureSettings) -> Capture:
     """Open a capture at the scale, and with the held-out cameras, that the settings ask for.
 
     Args:
-        path: the capture's folder.
+        path: the capture's folder, or FORMAT:DIR (body/source_captures.py).
         settings: of the run; `settings.path` is not read.
 
     Raises:
         FileNotFoundError, ValueError: the capture cannot be used (see `Capture.open`), or has no camera of a held-out name.
     """
-    capture = Capture.open(path, settings.image_scale)
+    capture = Capture.open(capture_folder(path), settings.image_scale)
     if settings.held_out_cameras:
         for name in settings.held_out_cameras:
             capture.stored_camera(name)  # refuses unknown names

@@ -21,11 +21,13 @@ from pathlib import Path
 from mitsuba_avatar import __version__
 from mitsuba_avatar.body.rig import Rig, load_rig, save_rig
 from mitsuba_avatar.captures.folder import Capture
+from mitsuba_avatar.captures.formats.opening import SourceName
 from mitsuba_avatar.files import atomic_path, check_writable
 from mitsuba_avatar.model.avatar import Avatar, DrivingStatistics
 from mitsuba_avatar.presets import load_settings, save_settings
 from mitsuba_avatar.settings import Settings
 from mitsuba_avatar.training.checkpoints import Checkpoints
+from mitsuba_avatar.training.readiness import open_as_set
 
 VERSIONED = ("mitsuba", "drjit", "torch", "numpy")
 
@@ -87,6 +89,15 @@ class RunFolder:
             raise ValueError(
                 f"RunFolder.open(): expected capture and face_size in {path / 'run.json'}; got: {error!r}. Restore the file."
             ) from error
+
+    def open_capture(self) -> Capture:
+        """The capture that the run was trained on, with the run's scale and held-out cameras.
+
+        Raises:
+            FileNotFoundError, ValueError: it is gone, or cannot be used.
+        """
+        is_in_place = SourceName.parse(self.settings.capture.path) is not None  # its folder in the cache may be gone
+        return open_as_set(self.settings.capture.path if is_in_place else self.capture_path, self.settings.capture)
 
     def check_capture(self, capture: Capture, rig: Rig) -> None:
         """Check that a capture shows the body that the run was trained on.

@@ -29,7 +29,7 @@ def test_round_trip(small_capture):
     np.testing.assert_array_equal(capture.encoded_image("left", 2), image)
     np.testing.assert_array_equal(capture.image("left", 2), decode_bytes(image, "srgb"))
     np.testing.assert_array_equal(capture.mask("left", 2), mask.astype(np.float32))
-    assert capture.image_path("left", 2).name == "000105.png", "files carry the frame's number, not its index"
+    assert capture.images.image_path("left", capture.frames[2].number).name == "000105.png", "files carry the frame's number, not its index"
 
 
 def test_selections(small_capture):

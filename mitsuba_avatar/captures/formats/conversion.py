@@ -6,29 +6,26 @@ resized in linear light. An interrupted conversion resumes; `capture.yaml` comes
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
 
 from mitsuba_avatar.captures.arrays import FRAME_ARRAYS
-from mitsuba_avatar.captures.cameras import Camera
-from mitsuba_avatar.captures.colour import decode_bytes, encode_bytes
-from mitsuba_avatar.captures.description import CaptureDescription
-from mitsuba_avatar.captures.folder import Capture, image_path
+from mitsuba_avatar.captures.description import CaptureDescription, ImagesFrom
+from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.captures.formats.files import FileSource
 from mitsuba_avatar.captures.formats.source import Source
+from mitsuba_avatar.captures.formats.straightening import CameraPlan, straight_cameras
+from mitsuba_avatar.captures.image_store import image_path
 from mitsuba_avatar.captures.images import ImageExtension, write_image
-from mitsuba_avatar.captures.undistortion import Lens, Undistortion, undistorted_camera, undistortion
 from mitsuba_avatar.captures.writer import CaptureWriter
 from mitsuba_avatar.files import atomic_path
 
 REPORT_FILE = "conversion.json"
-SAME_PIXELS = 1e-6  # pixels by which a camera may move before its images are remapped
 Track = Callable[[Sequence, str], Iterable]
 
 
@@ -44,6 +41,7 @@ class ConversionOptions:
         writes_vertices: whether registered meshes are written; their topology must come with a rig.
         own_sizes: whether every camera keeps the size of its images; otherwise all get that of the smallest.
         links: whether image files that need no change are linked to instead of copied, where the source has them as files.
+        images_from: writes everything but images, masks and plates, which are then read there; None writes them too.
     """
 
     scale: float = 1.0
@@ -53,6 +51,18 @@ class ConversionOptions:
     writes_vertices: bool = False
     own_sizes: bool = False
     links: bool = False
+    images_from: ImagesFrom | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale <= 1 or self.every < 1:
+            raise ValueError(
+                f"ConversionOptions(): expected 0 < scale <= 1 and every >= 1; got {self.scale} and {self.every}. Correct them."
+            )
+        if self.images_from is not None and (self.links or self.image_extension not in (None, "exr")):
+            raise ValueError(
+                "ConversionOptions(): expected neither links nor another image format where images are read in place; got "
+                f"links {self.links}, image_extension {self.image_extension}. Leave them out."
+            )
 
 
 def convert(
@@ -79,8 +89,6 @@ def convert(
         FileExistsError: if the folder holds a finished capture or something else.
         FileNotFoundError, ValueError: for a damaged or missing file; the message names it, and the capture stays unfinished.
     """
-    if not 0 < options.scale <= 1 or options.every < 1:
-        raise ValueError(f"convert(): expected 0 < scale <= 1 and every >= 1; got {options.scale} and {options.every}. Correct them.")
     info = source.info
     indices = tuple(range(0, len(info.frames), options.every))
     cameras = straight_cameras(info.cameras, info.lenses, options.scale, options.own_sizes)
@@ -91,13 +99,14 @@ def convert(
         keypoint_names=info.keypoint_names,
         held_out_cameras=options.held_out_cameras,
         image_extension=options.image_extension or info.image_extension,
+        images_from=options.images_from,
         licence=info.licence,
         source=info.source,
     )
     writer = CaptureWriter(path, description, cameras, [info.frames[index] for index in indices])
-    plans = [_plan(source, name, cameras[name]) for name in cameras]
+    plans = [CameraPlan.of(source, camera) for camera in cameras.values()] if options.images_from is None else []
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        for row in track(range(len(indices)), "Converting images"):
+        for row in track(range(len(indices)), "Converting images") if plans else ():
             # A list, so that the first complaint of a camera is raised here.
             list(pool.map(partial(_convert_pair, source, writer, (row, indices[row]), options.links), plans))
     for plan in plans:
@@ -108,52 +117,20 @@ def convert(
     return writer.finish()
 
 
-def straight_cameras(
-    cameras: Mapping[str, Camera], lenses: Mapping[str, Lens], scale: float = 1.0, own_sizes: bool = True
-) -> dict[str, Camera]:
-    """Cameras of the converted images: without distortion, each at its own size times `scale`, or all at one.
-
-    One size is that of the smallest image; larger ones are resized and cut to its shape, so that every pixel has a source.
-    """
-    if own_sizes:
-        sizes = {name: (max(1, round(scale * camera.width)), max(1, round(scale * camera.height))) for name, camera in cameras.items()}
-        return {name: undistorted_camera(camera, lenses.get(name, Lens()), *sizes[name]) for name, camera in cameras.items()}
-    smallest = min(cameras.values(), key=lambda camera: camera.width * camera.height)
-    width, height = max(1, round(scale * smallest.width)), max(1, round(scale * smallest.height))
-    return {name: undistorted_camera(camera, lenses.get(name, Lens()), width, height) for name, camera in cameras.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class _CameraPlan:
-    """What happens to the images of one camera; without a remap they stay as they are."""
-
-    camera: Camera
-    remap: Undistortion | None
-
-
-def _plan(source: Source, name: str, target: Camera) -> _CameraPlan:
-    """Prepare a camera's remap, where it needs one."""
-    camera, lens = source.info.cameras[name], source.info.lenses.get(name, Lens())
-    moved = [getattr(camera, key) - getattr(target, key) for key in ("width", "height", "fx", "fy", "cx", "cy")]
-    if lens.is_pinhole and np.abs(moved).max() < SAME_PIXELS:
-        return _CameraPlan(target, None)
-    return _CameraPlan(target, undistortion(camera, target, lens))
-
-
-def _convert_pair(source: Source, writer: CaptureWriter, place: tuple[int, int], links: bool, plan: _CameraPlan) -> None:
+def _convert_pair(source: Source, writer: CaptureWriter, place: tuple[int, int], links: bool, plan: CameraPlan) -> None:
     """Image and mask of one camera in one frame, unless they are there; `place` is the frame's row here and its index in the source."""
     name, (row, index) = plan.camera.name, place
     if source.info.has_masks and not writer.has_mask(name, row):
         mask = source.mask(name, index)
         if mask is None:
             raise FileNotFoundError(f"convert(): expected masks of every camera; got none of {name}. Name the cameras that have masks.")
-        writer.write_mask(name, row, _remapped_mask(mask, plan.remap))
+        writer.write_mask(name, row, plan.mask(mask))
     if writer.has_image(name, row):
         return
     pixels = source.image(name, index)  # decoded even where it is copied, so that a damaged file is found here
     extension = writer.description.image_extension
     if plan.remap is not None or extension != source.info.image_extension:
-        writer.write_image(name, row, _remapped_image(pixels, plan.remap, writer.description, extension))
+        writer.write_image(name, row, plan.image(pixels, is_float=extension == "exr"))
         return
     with atomic_path(image_path(writer.path, name, writer.frames[row].number, extension)) as temporary:
         if links and isinstance(source, FileSource):
@@ -162,31 +139,13 @@ def _convert_pair(source: Source, writer: CaptureWriter, place: tuple[int, int],
             temporary.write_bytes(source.encoded_image(name, index))
 
 
-def _remapped_image(
-    pixels: UInt8[np.ndarray, "h w 3"], remap: Undistortion | None, description: CaptureDescription, extension: str
-) -> UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]:
-    """An image through the remap in linear light, in the capture's curve."""
-    if remap is None and extension != "exr":
-        return pixels
-    linear = decode_bytes(pixels, description.colour_curve)
-    linear = linear if remap is None else remap.image(linear)
-    return linear if extension == "exr" else encode_bytes(linear, description.colour_curve)
-
-
-def _remapped_mask(mask: UInt8[np.ndarray, "h w"], remap: Undistortion | None) -> UInt8[np.ndarray, "H W"]:
-    """A mask through the remap."""
-    if remap is None:
-        return mask
-    return np.rint(255 * remap.mask(mask.astype(np.float32) / np.float32(255)).clip(0, 1)).astype(np.uint8)
-
-
-def _write_background(source: Source, writer: CaptureWriter, plan: _CameraPlan) -> None:
+def _write_background(source: Source, writer: CaptureWriter, plan: CameraPlan) -> None:
     """The plate of a camera, if the source has one."""
     plate = source.background(plan.camera.name)
     if plate is not None:
         extension = writer.description.image_extension
         path = writer.path / "backgrounds" / f"{plan.camera.name}.{extension}"
-        write_image(path, _remapped_image(plate, plan.remap, writer.description, extension))
+        write_image(path, plan.image(plate, is_float=extension == "exr"))
 
 
 def _write_arrays(source: Source, writer: CaptureWriter, indices: tuple[int, ...], writes_vertices: bool, track: Track) -> None:

@@ -328,7 +328,7 @@ class GoliathSource(Source):
 
     def _keypoint_ids(self, frames: tuple[Frame, ...]) -> tuple[list[str], str]:
         """Names of all keypoints, and a note if their schema is unknown: nobody documents it, so nothing may depend on it."""
-        if self._keypoints is None:
+        if self._keypoints is None or self.options.images_only:
             return [], ""
         ids: dict[str, None] = {}
         for frame in frames:

@@ -78,7 +78,7 @@ def write_goliath(capture: Capture, path: Path | str, body: GoliathBody | None, 
     if (path / CALIBRATION_FILE).exists():
         raise FileExistsError(f"write_goliath(): expected a new folder at {path}; got a finished capture. Choose another, or delete it.")
     numbers = [frame.number for frame in capture.frames]
-    has_masks = (capture.path / "masks").is_dir()
+    has_masks = capture.images.has_masks
     for name in track(list(capture.cameras), "Writing images"):
         _write_zip(path / f"image/cam{name}.zip", f"cam{name}/", numbers, "avif", _image_encoder(capture, name))
         if has_masks:

@@ -1,6 +1,8 @@
 """Which reader opens which format."""
 
+import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +26,37 @@ _OPENERS: Mapping[FormatName, Callable[[Path, SourceOptions], Source]] = {
     "dna": DnaRenderingSource,
 }
 
+FORMAT_NAMES: tuple[FormatName, ...] = tuple(_OPENERS)
+_FORMAT_PREFIX = re.compile(r"([A-Za-z0-9_]{2,}):(.*)", re.DOTALL)  # one letter is a drive
+
+
+@dataclass(frozen=True)
+class SourceName:
+    """A data set of another format as commands name it: FORMAT:DIR."""
+
+    format: FormatName
+    path: Path
+
+    @staticmethod
+    def parse(name: str) -> "SourceName | None":
+        """The data set that a word names; None for anything that does not begin with a format's name, or is a file's path.
+
+        Raises:
+            ValueError: for a word before the colon that is no format's.
+        """
+        match = _FORMAT_PREFIX.fullmatch(name)
+        if match is None or Path(name).exists():
+            return None
+        if match.group(1) not in _OPENERS:
+            raise ValueError(
+                f"SourceName: expected a folder, or FORMAT:DIR with FORMAT one of {', '.join(_OPENERS)}; got {name!r}. Correct it."
+            )
+        return SourceName(match.group(1), Path(match.group(2)))
+
+    def __str__(self) -> str:
+        """The same word with an absolute path, so that it means the same elsewhere."""
+        return f"{self.format}:{self.path.absolute()}"
+
 
 def open_source(format_name: FormatName, path: Path | str, options: SourceOptions = SourceOptions()) -> Source:  # noqa: B008 - frozen
     """Open a capture of another format in place.
@@ -33,7 +66,7 @@ def open_source(format_name: FormatName, path: Path | str, options: SourceOption
         ValueError: for an unknown format, files of another schema, or no frame that every camera has.
     """
     if format_name not in _OPENERS:
-        raise ValueError(f"open_source(): expected one of {', '.join(_OPENERS)}; got {format_name!r}. Choose one of them.")
+        raise ValueError(f"open_source(): expected one of the formats {', '.join(_OPENERS)}; got {format_name!r}. Choose one of them.")
     path = Path(path)
     if not path.is_dir():
         raise FileNotFoundError(f"open_source(): expected a folder at {path}; got none. Check the path.")

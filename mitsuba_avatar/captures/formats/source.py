@@ -10,13 +10,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 
 from mitsuba_avatar.captures.cameras import Camera, UpAxis
 from mitsuba_avatar.captures.colour import ColourCurve
+from mitsuba_avatar.captures.description import Distortion
 from mitsuba_avatar.captures.formats.decoding import decode_image
 from mitsuba_avatar.captures.frames import Frame
 from mitsuba_avatar.captures.images import ImageExtension
@@ -38,14 +38,16 @@ class SourceOptions:
         up: axis of the data set's world that points up; "auto" asks the cameras.
         distortion: "apply" the stored lens coefficients, "ignore" them, or do as the data set's own tools do ("auto").
         assets: file of the body model, for formats that keep it elsewhere.
+        images_only: leave out what takes long to list and has nothing to do with images (names of keypoints).
     """
 
     cameras: tuple[str, ...] = ()
     fps: float = 0.0
     test_frames: int = -1
     up: UpAxis = "auto"
-    distortion: Literal["auto", "apply", "ignore"] = "auto"
+    distortion: Distortion = "auto"
     assets: Path | None = None
+    images_only: bool = False
 
 
 @dataclass(frozen=True)

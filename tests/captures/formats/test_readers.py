@@ -105,7 +105,7 @@ def test_images_that_need_no_change_are_copied_byte_for_byte(name, data_sets, tm
     source = open_source(name, path, SourceOptions(distortion="ignore", cameras=tuple(sorted(data_sets[name][1].cameras)[:1])))
     capture = convert(source, tmp_path / "capture")
     camera = next(iter(capture.cameras))
-    assert capture.image_path(camera, 1).read_bytes() == source.encoded_image(camera, 1)
+    assert capture.images.image_path(camera, capture.frames[1].number).read_bytes() == source.encoded_image(camera, 1)
     assert not read_report(capture.path)["remapped_cameras"]
 
 
@@ -151,7 +151,7 @@ def test_dna_rendering_files_that_cannot_be_read_are_named(data_sets, tmp_path):
 def test_images_can_be_linked_to_instead_of_copied(data_sets, tmp_path):
     path, scene = data_sets["actorshq"]
     capture = convert(open_source("actorshq", path), tmp_path / "linked", ConversionOptions(links=True))
-    link = capture.image_path("Cam002", 3)
+    link = capture.images.image_path("Cam002", capture.frames[3].number)
     assert link.is_symlink() and link.resolve() == (path / "rgbs/Cam002/Cam002_rgb000003.jpg").resolve()
     assert largest_error(capture, scene) < 0.05
 
