@@ -128,7 +128,7 @@ def time_renderers(workload: Workload, rounds: int) -> Row:
 
 def write_noise_table(rig: Rig, rounds: int) -> None:
     """Measure and print what sample counts cost and what they give, row by row."""
-    from mitsuba_avatar.benchmarking.noise import contenders, measure_noise, noise_workload
+    from mitsuba_avatar.benchmarking.noise import CALLS, contenders, measure_averages, measure_noise, noise_workload, surface_contender
 
     workload = noise_workload(rig)
     swept = contenders(workload)
@@ -144,6 +144,16 @@ def write_noise_table(rig: Rig, rounds: int) -> None:
             f"{row.name:>24} {row.milliseconds:8.1f} {per_cent[0]:10.2f} {per_cent[1]:8.2f} {per_cent[2]:21.1f} {per_cent[3]:17.1f}\n"
         )
         sys.stdout.flush()
+    sys.stdout.write(
+        "\nstandard deviation of the mean over consecutive calls, per cent; in brackets what independent calls would give\n"
+        f"{'samples':>10}{'':>10}" + "".join(f"{calls:>8} calls " for calls in CALLS) + "\n"
+    )
+    for settings in ((1, 2), (4, 4)):
+        rows = 100 * measure_averages(surface_contender(workload, *settings), workload, max(rounds, 2))
+        for part, row in zip(("radiance", "mask"), rows, strict=True):
+            cells = [f" {value:6.2f} ({row[0] / calls**0.5:5.2f})" for value, calls in zip(row, CALLS, strict=True)]
+            sys.stdout.write(f"{settings[0]:>7}, {settings[1]}{part:>10}" + "".join(cells) + "\n")
+            sys.stdout.flush()
 
 
 def write_bias_table(rig: Rig, rounds: int) -> None:

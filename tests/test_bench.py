@@ -45,15 +45,26 @@ def test_noise_table(small, monkeypatch, capsys):
     from mitsuba_avatar.benchmarking import noise
 
     monkeypatch.setattr(noise, "SETTINGS", ((1, 1), (1, 8)))
-    for name, value in (("WIDTH", 40), ("HEIGHT", 30), ("VIEWS", 2)):
+    for name, value in (("WIDTH", 40), ("HEIGHT", 30), ("VIEWS", 2), ("CALLS", (1, 2, 4)), ("ORIENTATIONS", 2)):
         monkeypatch.setattr(noise, name, value)
     assert bench.main([*small, "--noise"]) == 0
-    rows = {line[:24].strip(): [float(word) for word in line[24:].split()] for line in capsys.readouterr().out.splitlines()[2:]}
+    first, second = capsys.readouterr().out.split("\n\n")
+    rows = {line[:24].strip(): [float(word) for word in line[24:].split()] for line in first.splitlines()[2:]}
     assert list(rows) == ["1, 1", "1, 8", "1, 18", "direct_projective"]
     for milliseconds, radiance, mask, *at_equal_time in rows.values():  # rounded where printed
         assert at_equal_time[0] == pytest.approx(radiance * milliseconds**0.5, rel=0.05, abs=0.1)
         assert np.isnan(mask) or at_equal_time[1] == pytest.approx(mask * milliseconds**0.5, rel=0.05, abs=0.1)
     assert rows["1, 8"][2] < 0.5 * rows["1, 1"][2], "samples on edges quiet the mask"
+    lines = second.splitlines()[2:]
+    assert [line[:20].split() for line in lines] == [
+        ["1,", "2", "radiance"],
+        ["1,", "2", "mask"],
+        ["4,", "4", "radiance"],
+        ["4,", "4", "mask"],
+    ]
+    for line in lines:
+        one, independent_one, *others = (float(word.strip("()")) for word in line[20:].replace("(", " ").split())
+        assert one == independent_one and others[1::2] == sorted(others[1::2], reverse=True)
 
 
 def test_bias_is_a_share_of_the_largest_derivative():

@@ -21,6 +21,8 @@ from mitsuba_avatar.rendering.surface import SurfaceRenderer
 SETTINGS = ((1, 1), (1, 2), (1, 4), (2, 2), (4, 1), (4, 2), (4, 4), (4, 8), (16, 4), (16, 8))
 ONE_PER_PIXEL = (1, 18)  # boundary samples as many as pixels, on the workload of `noise_workload`
 WIDTH, HEIGHT, VIEWS = 160, 256, 4
+CALLS = (1, 2, 4, 8, 16)  # consecutive ones that are averaged
+ORIENTATIONS = 6  # of the body: the noise of one depends on the random starts of few long edges
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def surface_contender(workload: Workload, samples: int, per_edge: int) -> Conten
         rows = []
         for part in range(2):  # a render each: one backward pass may follow it
             moved = vertices.clone().requires_grad_()
-            linear_losses(renderer, workload, moved, workload.textures, 2 * seed + part)[part].backward()
+            linear_losses(renderer, workload, moved, workload.textures, seed)[part].backward()
             rows.append(torch.einsum("pvc,kpvc->k", moved.grad.double(), motions.double()).numpy())
         return np.stack(rows)
 
@@ -127,3 +129,24 @@ def measure_noise(contender: Contender, workload: Workload, repeats: int, millis
     samples = np.stack([contender.derivatives(workload.vertices, motions, seed) for seed in range(1, repeats + 1)])
     deviation = np.sqrt((samples.std(axis=0, ddof=1) ** 2).mean(axis=1)) / np.abs(samples.mean(axis=0)).max(axis=1)
     return NoiseRow(contender.name, float(deviation[0]), float(deviation[1]), milliseconds)
+
+
+def measure_averages(contender: Contender, workload: Workload, repeats: int) -> Float[np.ndarray, "2 N"]:
+    """Deviations of the mean over each number of `CALLS`, of radiance and mask, as shares of the largest derivative.
+
+    Calls are consecutive: where their positions are drawn anew each time, deviations fall like the square root of the number.
+
+    Args:
+        repeats: means over the longest run of calls, for every orientation of the body.
+    """
+    squares = []
+    for k in range(ORIENTATIONS):
+        angle = torch.tensor(2 * np.pi * k / ORIENTATIONS)
+        x, y, z = workload.vertices.unbind(-1)
+        turned = torch.stack([angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y, z], dim=-1)
+        motions = body_motions(turned)
+        samples = np.stack([contender.derivatives(turned, motions, seed) for seed in range(repeats * max(CALLS))])
+        scale = np.abs(samples.mean(axis=0)).max(axis=1)
+        means = [samples.reshape(-1, calls, *samples.shape[1:]).mean(axis=1) for calls in CALLS]
+        squares.append([(mean.var(axis=0, ddof=1)).mean(axis=1) / scale**2 for mean in means])
+    return np.sqrt(np.mean(squares, axis=0)).T

@@ -27,7 +27,7 @@ from mitsuba_avatar.files import atomic_path, cache_folder
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.bridge import flat_array, torch_tensor
 from mitsuba_avatar.rendering.environment_map import EnvironmentMap
-from mitsuba_avatar.rendering.pixel_sampling import golden_lattice, random_shift
+from mitsuba_avatar.rendering.pixel_sampling import TEXELS, golden_lattice, random_shift
 from mitsuba_avatar.rendering.scene import MeshScene
 
 LIFT = 1e-3  # metres from the surface to a ray's start: past the surface itself, below any real crevice
@@ -119,7 +119,7 @@ class AmbientOcclusion:
         texel, ray_index = lane // self.rays, lane % self.rays
         origin = dr.gather(mi.Point3f, points, texel * 2)
         normal = dr.normalize(dr.gather(mi.Normal3f, points, texel * 2 + 1))
-        position = golden_lattice(ray_index, self.rays, random_shift(texel, dr.opaque(mi.UInt32, seed)))
+        position = golden_lattice(ray_index, self.rays, random_shift(texel, TEXELS, dr.opaque(mi.UInt32, seed), self.rays))
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(position))
         ray = mi.Ray3f(origin + normal * LIFT, direction)
         ray.maxt = self.distance

@@ -34,7 +34,7 @@ class SurfaceBatch:
         centers: packets [B, 4], local camera centres and the mesh index.
         texture_size: (h, w) texels.
         film: (width, height) pixels.
-        seed, seed_gradient: opaque UInt32, decorrelated.
+        seed: opaque UInt32.
         triangles, front: what `facing` finds.
         points, boxes: what `face_boxes` finds; boxes is None where no view shows a face.
     """
@@ -51,7 +51,6 @@ class SurfaceBatch:
     film: tuple[int, int]
     samples_per_pixel: int
     seed: object
-    seed_gradient: object
     triangles: object = None
     front: object = None
     points: object = None

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch, packet_vector
 from mitsuba_avatar.rendering.facing import VIEWS_PER_WORD, Triangle, num_words
-from mitsuba_avatar.rendering.pixel_sampling import TEA_ROUNDS
+from mitsuba_avatar.rendering.pixel_sampling import EDGES, random_offset
 from mitsuba_avatar.rendering.rasterization import nearest_faces
 from mitsuba_avatar.rendering.shading import AdjointImage, interpolated_uv
 from mitsuba_avatar.rendering.surface_tables import NO_FACE
@@ -191,9 +191,9 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
     ends = (base + edge.x, base + edge.y)
     point_a, point_b = (batch.point(view_index, end) for end in (edge.x, edge.y))
     pixel_a, pixel_b = view.project(point_a), view.project(point_b)
-    random, _ = mi.sample_tea_32(packed, batch.seed_gradient, TEA_ROUNDS)
+    offset = random_offset(packed, EDGES, batch.seed)
     share = dr.rcp(mi.Float(count))
-    along = (mi.Float(stratum) + mi.Float(random) * 2.0**-32) * share
+    along = (mi.Float(stratum) + offset) * share
     step = pixel_b - pixel_a
     length = dr.norm(step)
     position = pixel_a + step * along

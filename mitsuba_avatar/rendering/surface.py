@@ -90,7 +90,8 @@ class SurfaceRenderer:
             textures: [B, 3, h, w] linear radiance, one per view, row 0 at v = 1.
             cameras: B cameras.
             mesh_index: [B] which mesh each view shows; by default B / P consecutive views share a mesh.
-            seed: pixel jitter and boundary samples derive from it, decorrelated; equal seeds give equal images.
+            seed: pixel jitter and boundary samples derive from it; equal seeds give equal images, and those of consecutive seeds
+                complement each other (`pixel_sampling`): an optimizer counts up.
             background: linear radiance behind the surface: [3] one colour, [B, 3] one a view, or plates [B, 3, H, W]. None is black.
 
         Returns:
@@ -161,7 +162,6 @@ class SurfaceRenderer:
 
         mi = loaded_mitsuba()
         vertices, views, centers = tables
-        first, second = (dr.opaque(mi.UInt32, value) for value in decorrelated_seeds(seed))
         batch = SurfaceBatch(
             tables=self.tables,
             vertices=vertices.array,
@@ -174,8 +174,7 @@ class SurfaceRenderer:
             texture_size=(textures.shape[2], textures.shape[3]),
             film=self.film,
             samples_per_pixel=self.samples_per_pixel,
-            seed=first,
-            seed_gradient=second,
+            seed=dr.opaque(mi.UInt32, seed & 0xFFFFFFFF),
         )
         batch.triangles = facing.pack_triangles(batch)
         batch.front = facing.views_from_front(batch)
@@ -317,11 +316,6 @@ def _make_operation():
             return "mitsuba_avatar.surface"
 
     return SurfaceOperation
-
-
-def decorrelated_seeds(seed: int) -> tuple[int, int]:
-    """Seeds of the pixel jitter and of the boundary samples of one call: never equal to each other or to a neighbouring call's."""
-    return (2 * seed) & 0xFFFFFFFF, (2 * seed + 1) & 0xFFFFFFFF
 
 
 def unpack_gradient(packets):

@@ -9,7 +9,7 @@ from math import log2
 from mitsuba_avatar.rendering.backend import loaded_mitsuba
 from mitsuba_avatar.rendering.batch import SurfaceBatch
 from mitsuba_avatar.rendering.face_boxes import FilmUnits
-from mitsuba_avatar.rendering.pixel_sampling import jitter, random_shift
+from mitsuba_avatar.rendering.pixel_sampling import PIXELS, jitter, random_shift
 from mitsuba_avatar.rendering.rasterization import NearestFaces, ProjectedFace, normalized
 from mitsuba_avatar.rendering.views import View
 
@@ -132,7 +132,7 @@ def rasterize_pixels(batch: SurfaceBatch, tiles: Tiles) -> NearestFaces:
 
     def test(x, y, sample):
         slot = tiles.first_slot(boxes.view_index, x, y) * count + sample
-        pixel_offset = random_shift((boxes.view_index * batch.film[1] + y) * batch.film[0] + x, batch.seed)
+        pixel_offset = random_shift((boxes.view_index * batch.film[1] + y) * batch.film[0] + x, PIXELS, batch.seed, count)
         for k in range(at_once):
             position = mi.Point2f(x, y) + jitter(pixel_offset, sample + k, count)
             is_met, closeness = projected.meets(*normalized(view, position))
@@ -170,7 +170,7 @@ def trace_views(batch: SurfaceBatch) -> Hits | None:
     view_index, x, y = tiles.pixel_of_slot(slot // count)
     _, face, _ = nearest.at(slot)
     pixel = (view_index * batch.film[1] + y) * batch.film[0] + x
-    position = mi.Point2f(x, y) + jitter(random_shift(pixel, batch.seed), slot % count, count)
+    position = mi.Point2f(x, y) + jitter(random_shift(pixel, PIXELS, batch.seed, count), slot % count, count)
     barycentric, depth = meeting_point(batch, View.gather(batch.views, view_index), view_index, face, position)
     return Hits(len(slot), pixel, view_index, slot, len(nearest.keys), face, barycentric, depth, tiles)
 

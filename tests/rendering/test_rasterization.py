@@ -10,7 +10,7 @@ from mitsuba_avatar.rendering.batch import SurfaceBatch
 from mitsuba_avatar.rendering.bridge import flat_array
 from mitsuba_avatar.rendering.cameras import CameraBatch
 from mitsuba_avatar.rendering.face_boxes import FilmUnits
-from mitsuba_avatar.rendering.pixel_sampling import jitter, random_shift
+from mitsuba_avatar.rendering.pixel_sampling import PIXELS, jitter, random_shift
 from mitsuba_avatar.rendering.rasterization import nearest_faces
 from mitsuba_avatar.rendering.scene import MeshScene
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
@@ -138,7 +138,7 @@ def test_pixels_show_what_single_rays_meet(samples_per_pixel):
     batch = make_batch(renderer, vertices, meshes.orbit(3, 300, 220), [0, 1, 1])
     hits = trace_views(batch)
     view_index, x, y = hits.tiles.pixel_of_slot(hits.slot // samples_per_pixel)
-    offset = jitter(random_shift(hits.pixel, batch.seed), hits.slot % samples_per_pixel, samples_per_pixel)
+    offset = jitter(random_shift(hits.pixel, PIXELS, batch.seed, samples_per_pixel), hits.slot % samples_per_pixel, samples_per_pixel)
     is_met, face = nearest_faces(batch, view_index, mi.Point2f(x, y) + offset, mi.Bool(True))
     assert hits.count > 3000 * samples_per_pixel and dr.all(is_met)
     assert (face.numpy() != hits.face.numpy()).mean() < 1e-4

@@ -49,6 +49,25 @@ def test_no_kernel_is_compiled_after_warm_up(count):
     assert not compiled, f"{len(compiled)} of {len(history)} launches compiled a kernel, of sizes {[entry['size'] for entry in compiled]}"
 
 
+def test_calls_with_consecutive_seeds_complement_each_other():
+    """The mean of eight calls in a row is quieter than that of eight independent ones, whose deviation is one's over the root of eight."""
+    vertices, topology = meshes.sphere(2)
+    vertices = torch.tensor(np.stack([vertices, 0.8 * vertices]), dtype=torch.float32)
+    renderer, cameras = SurfaceRenderer(topology, *FILM, boundary_samples_per_edge=2), meshes.orbit(4, *FILM)
+    weights = torch.linspace(-1, 1, FILM[0]) * torch.linspace(0, 1, FILM[1])[:, None]
+
+    def gradient(seed: int) -> torch.Tensor:
+        moved = vertices.clone().requires_grad_()
+        _, mask = renderer.render(moved, torch.ones(4, 3, 5, 7), cameras, seed=seed)
+        (mask * weights).sum().backward()
+        return moved.grad.sum(dim=1)
+
+    gradients = torch.stack([gradient(seed) for seed in range(96)])
+    alone = gradients.std(dim=0).square().mean().sqrt()
+    together = gradients.reshape(12, 8, 2, 3).mean(dim=1).std(dim=0).square().mean().sqrt()
+    assert 0 < together < 0.6 * alone / 8**0.5
+
+
 def resident_bytes() -> int:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096
