@@ -189,7 +189,7 @@ def write_bias_table(rig: Rig, rounds: int) -> None:
 
 
 def take_turns(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, float]:
-    """Milliseconds a call: the median over `rounds` rounds, in each of which every contender has one turn.
+    """Median milliseconds of a call; in each of the rounds every contender has one turn.
 
     In its turn a contender runs in a loop, as a training does, until `TURN_SECONDS` have passed. The first call of a turn is not
     counted, whoever's it is: it pays for what the others left in caches and in the allocator.
@@ -201,11 +201,12 @@ def take_turns(calls: dict[str, Callable[[], None]], rounds: int) -> dict[str, f
     for _ in range(rounds):
         for name, call in calls.items():
             call()
-            started, count = time.perf_counter(), 0
-            while count == 0 or time.perf_counter() - started < TURN_SECONDS:
+            turn_started = started = time.perf_counter()
+            while started - turn_started < TURN_SECONDS:
                 call()
-                count += 1
-            times[name].append(1e3 * (time.perf_counter() - started) / count)
+                ended = time.perf_counter()
+                times[name].append(1e3 * (ended - started))
+                started = ended
     return {name: float(np.median(values)) for name, values in times.items()}
 
 

@@ -44,7 +44,9 @@ def place(vertices: Float[Tensor, "P V 3"], cameras: CameraBatch, mesh_index: In
     centers = cameras.centers.to(device) - mean[mesh_index]
     views = torch.cat([cameras.intrinsics.to(device), rotation.reshape(-1, 9), centers], dim=1)
     centers = torch.cat([centers, mesh_index[:, None].to(torch.float32)], dim=1)
-    return Placement(torch.nn.functional.pad(vertices - mean[:, None], (0, 1)), views, centers)
+    packets = vertices.new_zeros(*vertices.shape[:2], 4)
+    torch.sub(vertices, mean[:, None], out=packets[:, :, :3])
+    return Placement(packets, views, centers)
 
 
 @dataclass
