@@ -72,7 +72,7 @@ def load_chart(folder: Path | str) -> ColourChart:
     if not path.is_file():
         raise FileNotFoundError(f"load_chart(): expected a chart's description at {path}; got none. Film or photograph a chart first.")
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
         if document["format_version"] != FORMAT_VERSION:
             raise ValueError(f"format_version {document['format_version']}")
         cameras = document["cameras"]

@@ -43,7 +43,7 @@ def load_corrections(folder: Path | str) -> dict[str, Float64[np.ndarray, "3 4"]
     if not path.is_file():
         return {}
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
         if document["format_version"] != FORMAT_VERSION:
             raise ValueError(f"format_version {document['format_version']}")
         return {name: np.array(rows, np.float64).reshape(3, 4) for name, rows in document["cameras"].items()}

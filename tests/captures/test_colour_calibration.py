@@ -76,6 +76,7 @@ def test_a_picture_that_is_too_bright_is_refused(patches: np.ndarray, tmp_path: 
 
 def test_a_chart_survives_its_file_and_broken_ones_are_named(patches: np.ndarray, tmp_path: Path):
     save_chart(tmp_path, _chart(patches))
+    (tmp_path / "chart.json").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "chart.json").read_bytes())  # as some editors save it
     chart = load_chart(tmp_path)
     assert (chart.rows, chart.columns) == (ROWS, COLUMNS)
     np.testing.assert_allclose(chart.reference["right"], patches, atol=1e-6)

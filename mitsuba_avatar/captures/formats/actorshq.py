@@ -10,24 +10,27 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.captures.formats.data_set import Contents, DataSet
 from mitsuba_avatar.captures.formats.decoding import read_table
 from mitsuba_avatar.captures.formats.files import FileSource, extension_of, files_by_number, first_size, needed
 from mitsuba_avatar.captures.formats.source import (
-    SourceInfo,
     SourceOptions,
     chosen_cameras,
     common_frames,
-    timed_frames,
-    turned_camera,
     upright_world,
 )
 from mitsuba_avatar.captures.rigid import inverse_rigid
 
 COLUMNS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
-FPS = 25.0
-TEST_FRAMES = 300  # of a whole sequence, by the custom of the papers that use it
+DATA_SET = DataSet(
+    "ActorsHQ",
+    25.0,
+    "the data set has no body model",
+    "ActorsHQ licence (CC BY-NC 4.0)",
+    folders=3,
+    test_frames=300,  # by the custom of the papers that use it
+)
 SCALES = ("1x", "2x", "4x")
-LACKS = ("the body: rig.npz, pose.npy, root.npy, face.npy, vertices.npy (the data set has no body model)",)
 
 
 def open_actorshq(path: Path | str, options: SourceOptions = SourceOptions()) -> FileSource:  # noqa: B008 - frozen
@@ -50,23 +53,8 @@ def open_actorshq(path: Path | str, options: SourceOptions = SourceOptions()) ->
     numbers, missing = common_frames(None, needed(images, masks), path)
     native = {name: _camera(rows[name], first_size(images[name]), calibration) for name in names}
     turn = upright_world(native.values(), options.up, path)
-    test_frames = options.test_frames
-    if test_frames < 0 and len(numbers) > 2 * TEST_FRAMES:
-        test_frames = TEST_FRAMES
-    fps = options.fps or FPS
-    info = SourceInfo(
-        name="_".join(path.resolve().parts[-3:]),
-        fps=fps,
-        cameras={name: turned_camera(camera, turn) for name, camera in native.items()},
-        frames=timed_frames(numbers, fps, test_frames),
-        missing=missing,
-        image_extension=extension_of(images),
-        has_masks=any(masks.values()),
-        lacks=LACKS,
-        notes=tuple(notes),
-        licence="ActorsHQ licence (CC BY-NC 4.0)",
-        source=f"ActorsHQ {'/'.join(path.resolve().parts[-3:])}",
-    )
+    contents = Contents(native, turn, numbers, missing, extension_of(images), any(masks.values()), notes=notes)
+    info = DATA_SET.info(path, options, contents)
     return FileSource(info, images, masks)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.captures.formats.data_set import Contents, DataSet
 from mitsuba_avatar.captures.formats.decoding import parse_json, require_file
 from mitsuba_avatar.captures.formats.files import (
     FilesByFrame,
@@ -26,14 +27,13 @@ from mitsuba_avatar.captures.formats.source import (
     SourceOptions,
     chosen_cameras,
     common_frames,
-    timed_frames,
-    turned_camera,
     upright_world,
 )
 from mitsuba_avatar.captures.undistortion import Lens
 
-FPS = 30.0
-LACKS = ("the body: rig.npz, pose.npy, root.npy, face.npy, vertices.npy (SMPL-X parameters are no rig of ours)",)
+_FACTS = (30.0, "SMPL-X parameters are no rig of ours")
+AVATARREX = DataSet("AvatarReX", *_FACTS, "AvatarReX: non-commercial research, no redistribution")
+THUMAN4 = DataSet("THuman4.0", *_FACTS, "THuman4.0: non-commercial research, no redistribution")
 
 
 class AvatarRexSource(FileSource):
@@ -72,7 +72,7 @@ def open_avatarrex(path: Path | str, options: SourceOptions = SourceOptions()) -
     def folders(name: str) -> tuple[Path, Path]:
         return path / name, path / name / "mask/pha"
 
-    return _open(path, path / "calibration_full.json", recorded, folders, options, "AvatarReX")
+    return _open(path, path / "calibration_full.json", recorded, folders, options, AVATARREX)
 
 
 def open_thuman4(path: Path | str, options: SourceOptions = SourceOptions()) -> AvatarRexSource:  # noqa: B008 - frozen
@@ -84,11 +84,16 @@ def open_thuman4(path: Path | str, options: SourceOptions = SourceOptions()) -> 
     def folders(name: str) -> tuple[Path, Path]:
         return path / "images" / name, path / "masks" / name
 
-    return _open(path, path / "calibration.json", recorded, folders, options, "THuman4.0")
+    return _open(path, path / "calibration.json", recorded, folders, options, THUMAN4)
 
 
 def _open(
-    path: Path, calibration: Path, recorded: list[str], folders: Callable[[str], tuple[Path, Path]], options: SourceOptions, data_set: str
+    path: Path,
+    calibration: Path,
+    recorded: list[str],
+    folders: Callable[[str], tuple[Path, Path]],
+    options: SourceOptions,
+    data_set: DataSet,
 ) -> AvatarRexSource:
     """What both have in common; `folders` gives a camera's folders of images and masks."""
     require_file(calibration, "Name the folder of one subject.")
@@ -105,21 +110,8 @@ def _open(
     native = {name: _camera(name, document[name], first_size(images[name]), calibration) for name in names}
     lenses = {name: Lens(tuple(float(v) for v in np.ravel(document[name].get("distCoeff") or ()))) for name in names}
     turn = upright_world(native.values(), options.up, path)
-    fps = options.fps or FPS
-    info = SourceInfo(
-        name=path.resolve().name,
-        fps=fps,
-        cameras={name: turned_camera(camera, turn) for name, camera in native.items()},
-        lenses={name: lens for name, lens in lenses.items() if not lens.is_pinhole} if options.distortion != "ignore" else {},
-        frames=timed_frames(numbers, fps, options.test_frames),
-        missing=missing,
-        image_extension=extension_of(images),
-        has_masks=any(masks.values()),
-        lacks=LACKS,
-        notes=tuple(notes),
-        licence=f"{data_set}: non-commercial research, no redistribution",
-        source=f"{data_set} {path.resolve().name}",
-    )
+    contents = Contents(native, turn, numbers, missing, extension_of(images), any(masks.values()), lenses, notes)
+    info = data_set.info(path, options, contents)
     return AvatarRexSource(path, info, images, masks)
 
 

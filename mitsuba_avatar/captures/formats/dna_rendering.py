@@ -12,28 +12,26 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.captures.formats.data_set import Contents, DataSet
 from mitsuba_avatar.captures.formats.decoding import decode_labels, encoded_size
 from mitsuba_avatar.captures.formats.files import camera_from_matrices
 from mitsuba_avatar.captures.formats.source import (
     Source,
-    SourceInfo,
     SourceOptions,
     chosen_cameras,
     common_frames,
-    timed_frames,
-    turned_camera,
     turned_points,
     upright_world,
 )
+from mitsuba_avatar.captures.images import PNG_SIGNATURE
 from mitsuba_avatar.captures.rigid import inverse_rigid, is_rigid
 from mitsuba_avatar.captures.undistortion import Lens
 
 if TYPE_CHECKING:
     import h5py
 
-FPS = 15.0
+DATA_SET = DataSet("DNA-Rendering", 15.0, "SMPL-X parameters are no rig of ours", "DNA-Rendering: research only, by agreement")
 IMAGE_GROUPS = ("Camera_5mp", "Camera_12mp")
-LACKS = ("the body: rig.npz, pose.npy, root.npy, face.npy, vertices.npy (SMPL-X parameters are no rig of ours)",)
 
 
 class DnaRenderingSource(Source):
@@ -66,21 +64,18 @@ class DnaRenderingSource(Source):
         native = {name: self._camera(name, parameters[name]) for name in names}
         self._world_from_native = upright_world(native.values(), options.up, path)
         lenses = {name: Lens(tuple(float(value) for value in np.ravel(parameters[name]["D"][()]))) for name in names}
-        fps = options.fps or FPS
-        self.info = SourceInfo(
-            name=path.resolve().name,
-            fps=fps,
-            cameras={name: turned_camera(camera, self._world_from_native) for name, camera in native.items()},
-            lenses={name: lens for name, lens in lenses.items() if not lens.is_pinhole} if options.distortion != "ignore" else {},
-            frames=timed_frames(numbers, fps, options.test_frames),
-            missing=missing,
-            image_extension="png" if self._bytes(self._colours[names[0]][self._first[names[0]]]).startswith(b"\x89PNG") else "jpg",
-            has_masks=bool(self._masks),
-            lacks=LACKS,
-            notes=(*notes, "the data set's colour calibration is not applied"),
-            licence="DNA-Rendering: research only, by agreement",
-            source=f"DNA-Rendering {path.resolve().name}",
+        first = self._bytes(self._colours[names[0]][self._first[names[0]]])
+        contents = Contents(
+            native,
+            self._world_from_native,
+            numbers,
+            missing,
+            "png" if first.startswith(PNG_SIGNATURE) else "jpg",
+            bool(self._masks),
+            lenses,
+            (*notes, "the data set's colour calibration is not applied"),
         )
+        self.info = DATA_SET.info(path, options, contents)
 
     def where(self, camera_name: str, frame_index: int) -> str:
         """The image's data set inside the file."""

@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from mitsuba_avatar.captures.cameras import Camera
+from mitsuba_avatar.captures.formats.data_set import Contents, DataSet
 from mitsuba_avatar.captures.formats.decoding import parse_json
 from mitsuba_avatar.captures.formats.files import (
     FilesByFrame,
@@ -29,8 +30,6 @@ from mitsuba_avatar.captures.formats.source import (
     SourceOptions,
     chosen_cameras,
     common_frames,
-    timed_frames,
-    turned_camera,
     turned_points,
     upright_world,
 )
@@ -38,9 +37,8 @@ from mitsuba_avatar.captures.undistortion import Lens
 
 INTRINSICS_FILE = "intri.yml"
 EXTRINSICS_FILE = "extri.yml"
-FPS = 30.0
+DATA_SET = DataSet("EasyMocap folder", 30.0, "SMPL parameters are no rig of ours")
 MASK_FOLDERS = ("mask", "masks", "mask_cihp", "mask-schp")
-LACKS = ("the body: rig.npz, pose.npy, root.npy, face.npy, vertices.npy (SMPL parameters are no rig of ours)",)
 
 
 class EasyMocapSource(FileSource):
@@ -109,22 +107,10 @@ def open_easymocap(path: Path | str, options: SourceOptions = SourceOptions()) -
     masks = {name: files_by_number(mask_folder / name) for name in names}
     numbers, missing = common_frames(None, needed(images, masks), path)
     native = {name: _camera(name, intrinsics, extrinsics, first_size(images[name]), path) for name in names}
-    lenses = {name: _lens(name, intrinsics, path) for name in names} if options.distortion != "ignore" else {}
+    lenses = {name: _lens(name, intrinsics, path) for name in names}
     turn = upright_world(native.values(), options.up, path)
-    fps = options.fps or FPS
-    info = SourceInfo(
-        name=path.resolve().name,
-        fps=fps,
-        cameras={name: turned_camera(camera, turn) for name, camera in native.items()},
-        lenses={name: lens for name, lens in lenses.items() if not lens.is_pinhole},
-        frames=timed_frames(numbers, fps, options.test_frames),
-        missing=missing,
-        image_extension=extension_of(images),
-        has_masks=any(masks.values()),
-        lacks=LACKS,
-        notes=tuple(notes),
-        source=f"EasyMocap folder {path.resolve().name}",
-    )
+    contents = Contents(native, turn, numbers, missing, extension_of(images), any(masks.values()), lenses, notes)
+    info = DATA_SET.info(path, options, contents)
     return EasyMocapSource(path, info, images, masks, turn)
 
 

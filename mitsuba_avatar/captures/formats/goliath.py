@@ -231,7 +231,7 @@ class GoliathSource(Source):
             template, _ = decode_ply(path.read_bytes(), str(path))
         elif path.with_suffix(".obj").is_file():
             path = path.with_suffix(".obj")
-            lines = [line.split()[1:4] for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("v ")]
+            lines = [line.split()[1:4] for line in path.read_text(encoding="utf-8-sig").splitlines() if line.startswith("v ")]
             template = np.array(lines, dtype=np.float32).reshape(-1, 3)
         else:
             return model.rest_vertices

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from mitsuba_avatar.captures.formats.data_set import Contents, DataSet
 from mitsuba_avatar.captures.formats.decoding import require_file
 from mitsuba_avatar.captures.formats.files import FilesByFrame, FileSource, camera_from_matrices, extension_of, first_size, needed
 from mitsuba_avatar.captures.formats.safe_pickle import load_object_array
@@ -17,17 +18,14 @@ from mitsuba_avatar.captures.formats.source import (
     SourceOptions,
     chosen_cameras,
     common_frames,
-    timed_frames,
-    turned_camera,
     turned_points,
     upright_world,
 )
 from mitsuba_avatar.captures.undistortion import Lens
 
-FPS = 50.0
+DATA_SET = DataSet("ZJU-MoCap", 50.0, "SMPL parameters are no rig of ours", "ZJU-MoCap: research only, by agreement")
 METRES = 1e-3  # of a millimetre
 MASK_FOLDERS = ("mask_cihp", "mask")
-LACKS = ("the body: rig.npz, pose.npy, root.npy, face.npy, vertices.npy (SMPL parameters are no rig of ours)",)
 
 
 class NeuralBodySource(FileSource):
@@ -120,21 +118,8 @@ def open_neuralbody(path: Path | str, options: SourceOptions = SourceOptions()) 
     }
     lenses = {name: Lens(tuple(float(value) for value in cams["D"][place].ravel())) for name, place in places.items()}
     turn = upright_world(native.values(), options.up, path)
-    fps = options.fps or FPS
-    info = SourceInfo(
-        name=path.resolve().name,
-        fps=fps,
-        cameras={name: turned_camera(camera, turn) for name, camera in native.items()},
-        lenses={name: lens for name, lens in lenses.items() if not lens.is_pinhole} if options.distortion != "ignore" else {},
-        frames=timed_frames(numbers, fps, options.test_frames),
-        missing=missing,
-        image_extension=extension_of(images),
-        has_masks=any(masks.values()),
-        lacks=LACKS,
-        notes=tuple(notes),
-        licence="ZJU-MoCap: research only, by agreement",
-        source=f"ZJU-MoCap {path.resolve().name}",
-    )
+    contents = Contents(native, turn, numbers, missing, extension_of(images), any(masks.values()), lenses, notes)
+    info = DATA_SET.info(path, options, contents)
     counts_from_one = not any((path / kind / "0.npy").is_file() for kind in ("vertices", "params", "new_params"))
     return NeuralBodySource(path, info, images, masks, turn, int(counts_from_one))
 
