@@ -208,13 +208,14 @@ def _draw(
 ) -> "FrameClock":
     """Decode, render, write."""
     from mitsuba_avatar.body.source_captures import capture_folder
+    from mitsuba_avatar.captures.cameras import film_size
     from mitsuba_avatar.captures.folder import DESCRIPTION_FILE, Capture
     from mitsuba_avatar.driving.animation import FrameClock, animate, outline
     from mitsuba_avatar.loaded_run import avatar_occlusion
     from mitsuba_avatar.progress import progress_bar
     from mitsuba_avatar.rendering.surface import SurfaceRenderer
     from mitsuba_avatar.reporting.figures import Tile, compose, save_image
-    from mitsuba_avatar.reporting.video import write_video
+    from mitsuba_avatar.reporting.video import centred, write_video
     from mitsuba_avatar.reporting.view_transform import ViewTransform, write_png
 
     count, transform, clock = len(signals), ViewTransform(), FrameClock()
@@ -225,7 +226,8 @@ def _draw(
     cameras, turns = _cameras(command, capture, outline(avatar, signals), count)
     signals = signals.turned(turns)
     samples = command.samples or run.settings.evaluation.samples_per_pixel
-    renderer = SurfaceRenderer(run.rig.topology, cameras[0].width, cameras[0].height, samples_per_pixel=samples)
+    size = film_size(cameras)
+    renderer = SurfaceRenderer(run.rig.topology, *size, samples_per_pixel=samples)
     frames = animate(avatar, signals, latents, list(enumerate(cameras)), renderer, avatar_occlusion(run), clock)
     kept = {round(i * (count - 1) / max(1, OVERVIEW - 1)) for i in range(OVERVIEW)}
     tiles = []
@@ -242,7 +244,7 @@ def _draw(
                 yield picture
 
     if "mp4" in command.format:
-        write_video(folder / "drive.mp4", pictures(), signals.fps)
+        write_video(folder / "drive.mp4", (centred(picture, *size, transform.backdrop_bytes()) for picture in pictures()), signals.fps)
     else:
         for _ in pictures():
             pass
@@ -264,8 +266,6 @@ def _cameras(
         if not names:
             raise ValueError(f"{capture.path} has no held-out cameras. Use --path orbit, or list some in capture.yaml.")
         cameras = [capture.cameras[names[i * len(names) // count]] for i in range(count)]  # one after the other: a cut, not a flicker
-        if len({(camera.width, camera.height) for camera in cameras}) > 1:
-            raise ValueError(f"expected held-out cameras of one image size in {capture.path}. Use --path orbit.")
     elif command.path == "front":
         cameras = camera_paths.orbit(points, 1, *size) * count
     else:

@@ -112,7 +112,7 @@ def _render(command: RenderCommand) -> Path:
     todo = {views[i].name: views[i] for i in reversed(mine) if any(folder.needs(f"{views[i].name}.{ending}") for ending in endings)}
     if todo:
         has_albedo = "exr" in endings or (command.scene != "" and command.light == "relit")
-        painter = _painter(command, loaded, views[0], folder, has_albedo)
+        painter = _painter(command, loaded, views, folder, has_albedo)
         with progress_bar("rendering", len(mine), len(mine) - len(todo)) as bar:
             for done, view in enumerate(sorted(todo.values(), key=lambda view: view.number)):
                 drawn = painter.draw(view, has_layers="exr" in endings)
@@ -120,7 +120,7 @@ def _render(command: RenderCommand) -> Path:
                     if folder.needs(f"{view.name}.{ending}"):
                         _write(folder.path / f"{view.name}.{ending}", drawn, transform, loaded)
                 bar.update(len(mine) - len(todo) + done + 1)
-    return _video(command, folder, views) if "mp4" in command.format else folder.path
+    return _video(command, folder, views, transform) if "mp4" in command.format else folder.path
 
 
 def _views(command: RenderCommand, loaded: "LoadedRun") -> list["NovelView"]:
@@ -142,12 +142,6 @@ def _views(command: RenderCommand, loaded: "LoadedRun") -> list["NovelView"]:
             known = [capture.cameras[name] for name in capture.camera_names(held_out=True)]
         if not known:
             raise ValueError(f"{capture.path} has no held-out cameras. Use --path orbit, or list some in capture.yaml.")
-        sizes = {(camera.width, camera.height) for camera in known}
-        if len(sizes) > 1:
-            raise ValueError(
-                f"expected {'held-out cameras' if command.path == 'held_out' else 'cameras'} of one image size in "
-                f"{command.file or capture.path}; got {sorted(sizes)}. Use --path orbit."
-            )
         cameras = [known[i % len(known)] for i in range(command.frames)]
     elif command.path == "keyframes":
         cameras = camera_paths.key_framed(command.file, *size)
@@ -181,10 +175,13 @@ def _frames(command: RenderCommand, loaded: "LoadedRun") -> list[int]:
     return list(range(first, first + command.frames))
 
 
-def _painter(command: RenderCommand, loaded: "LoadedRun", first: "NovelView", folder: "PictureFolder", has_albedo: bool) -> "ViewPainter":
+def _painter(
+    command: RenderCommand, loaded: "LoadedRun", views: list["NovelView"], folder: "PictureFolder", has_albedo: bool
+) -> "ViewPainter":
     """What draws the pictures; the folder settles how many samples a time budget means."""
     from dataclasses import replace
 
+    from mitsuba_avatar.captures.cameras import film_size
     from mitsuba_avatar.progress import progress_bar
     from mitsuba_avatar.rendering.lit_scene import LitScene
     from mitsuba_avatar.rendering.path_tracing import PathTracer, SampleBudget
@@ -204,8 +201,8 @@ def _painter(command: RenderCommand, loaded: "LoadedRun", first: "NovelView", fo
         with progress_bar("albedo", len(shown.frames)) as bar:
             albedo = estimate_albedo(shown, CapturedLight.of(trained, command.captured_light), bar.update)
     playback = Playback(loaded.avatar, loaded.capture, loaded.occlusion())
-    painter = ViewPainter(playback, loaded.renderer(first.camera.width, first.camera.height), albedo, tracer, budget)
-    settled = folder.settle(lambda: {"samples": painter.samples_within(command.seconds, first)} if command.seconds else {})
+    painter = ViewPainter(playback, loaded.renderer(*film_size(view.camera for view in views)), albedo, tracer, budget)
+    settled = folder.settle(lambda: {"samples": painter.samples_within(command.seconds, views[0])} if command.seconds else {})
     return replace(painter, budget=SampleBudget(settled["samples"])) if command.seconds else painter
 
 
@@ -224,10 +221,11 @@ def _write(path: Path, drawn: "DrawnView", transform: "ViewTransform", loaded: "
             trimesh.Trimesh(drawn.vertices, loaded.run.rig.topology.faces, process=False).export(temporary)
 
 
-def _video(command: RenderCommand, folder: "PictureFolder", views: list["NovelView"]) -> Path:
+def _video(command: RenderCommand, folder: "PictureFolder", views: list["NovelView"], transform: "ViewTransform") -> Path:
     """The video, once all its pictures are there; until then the folder."""
+    from mitsuba_avatar.captures.cameras import film_size
     from mitsuba_avatar.captures.images import read_image
-    from mitsuba_avatar.reporting.video import write_video
+    from mitsuba_avatar.reporting.video import centred, write_video
 
     paths = [folder.path / f"{view.name}.png" for view in views]
     missing = sum(not path.exists() for path in paths)
@@ -235,7 +233,8 @@ def _video(command: RenderCommand, folder: "PictureFolder", views: list["NovelVi
         sys.stderr.write(f"render: the video waits for {missing} pictures of other shards; run again when they are drawn.\n")
         return folder.path
     output = folder.path.with_name(f"{folder.path.name}.mp4")
-    write_video(output, (read_image(path) for path in paths), command.fps)
+    size, colour = film_size(view.camera for view in views), transform.backdrop_bytes()
+    write_video(output, (centred(read_image(path), *size, colour) for path in paths), command.fps)
     return output
 
 

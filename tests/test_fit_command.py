@@ -280,7 +280,10 @@ BAD_CAPTURES = {
     "missing pose": (lambda folder: (folder / "pose.npy").unlink(), ["pose.npy", "got none", "add the files"]),
     "missing masks": (lambda folder: shutil.rmtree(folder / "masks"), ["/masks", "got none", "Segment"]),
     "missing vertices": (lambda folder: (folder / "vertices.npy").unlink(), ["vertices.npy", "got none", "model.use_latent false"]),
-    "unfinished": (lambda folder: (folder / "capture.yaml").unlink(), ["got no capture.yaml", "or a data set as FORMAT:DIR"]),
+    "unfinished": (
+        lambda folder: (folder / "capture.yaml").unlink(),
+        ["capture.yaml", "got no capture.yaml", "as FORMAT:DIR"],
+    ),
 }
 
 

@@ -102,18 +102,27 @@ def test_a_capture_without_held_out_cameras_has_none_to_render(fitted_run, drawn
     assert "has no held-out cameras. Use --path orbit" in capsys.readouterr().err
 
 
-def test_held_out_cameras_of_several_sizes_cannot_share_a_film(fitted_run, drawn_capture, private_cache, tmp_path, capsys):
-    """A driving capture needs neither images nor masks, so only the cameras themselves tell."""
+def test_held_out_cameras_of_several_sizes_keep_them_and_meet_in_the_video(fitted_run, drawn_capture, private_cache, tmp_path):
+    """The smaller camera sees what it sees alone; in the video it is centred on the backdrop."""
     shutil.copytree(drawn_capture.path, tmp_path / "copy", ignore=shutil.ignore_patterns("*.png"))
     document = json.loads((tmp_path / "copy/cameras.json").read_text())
     document["cameras"][0]["width"] = 64
     (tmp_path / "copy/cameras.json").write_text(json.dumps(document))
     description = tmp_path / "copy/capture.yaml"
     description.write_text(description.read_text().replace(f"- {HELD_OUT}", f"- {HELD_OUT}\n- front"))
-    assert main([str(fitted_run), "--path", "held_out", "--capture", str(tmp_path / "copy")]) == 2
-    assert "expected held-out cameras of one image size" in capsys.readouterr().err
-    words = ("--frames", "1", "--width", "30", "--height", "44", "--out", str(tmp_path / "out"))
-    assert main([str(fitted_run), "--capture", str(tmp_path / "copy"), *words]) == 0
+    words = ("--capture", str(tmp_path / "copy"), "--path", "held_out", "--frames", "2", "--hold", "29", "--format", "mp4", "exr")
+    assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
+    names = ("front_000029", f"{HELD_OUT}_000029")
+    pictures = [read_image(tmp_path / f"out/{name}.png") for name in names]
+    assert [picture.shape for picture in pictures] == [(HEIGHT, 64, 3), (HEIGHT, WIDTH, 3)] and WIDTH != 64
+    assert [len(np.unique(picture)) > 20 for picture in pictures] == [True, True], "both see somebody"
+    assert [read_exr(tmp_path / f"out/{name}.exr")["depth"].shape for name in names] == [picture.shape[:2] for picture in pictures]
+    with av.open(str(tmp_path / "out.mp4")) as container:
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+    assert [frame.shape for frame in frames] == 2 * [(HEIGHT, 64, 3)]
+    margin = (64 - WIDTH) // 2
+    assert np.abs(frames[1][:, margin : margin + WIDTH] - pictures[1]).mean() < 4, "the smaller picture is in the middle"
+    assert np.abs(frames[1][:, : margin - 2] - pictures[1][0, 0]).max() < 8, "on the backdrop"
 
 
 def test_a_place_that_cannot_be_written_is_one_line(fitted_run, private_cache, tmp_path, capsys):

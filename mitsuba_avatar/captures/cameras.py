@@ -6,7 +6,7 @@ cx and cy by their reader, before they arrive here.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -125,6 +125,12 @@ class Camera:
         bent_x = x * radial + 2 * p1 * x * y + p2 * (squared_radius + 2 * x * x)
         bent_y = y * radial + p1 * (squared_radius + 2 * y * y) + 2 * p2 * x * y
         return np.stack([bent_x, bent_y], axis=-1)
+
+
+def film_size(cameras: Iterable[Camera]) -> tuple[int, int]:
+    """(width, height) of the smallest film that holds the image of every camera in its upper left corner."""
+    cameras = list(cameras)
+    return max(camera.width for camera in cameras), max(camera.height for camera in cameras)
 
 
 def look_at(centre: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:

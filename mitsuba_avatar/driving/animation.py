@@ -86,8 +86,8 @@ def animate(
         avatar: to be driven.
         signals: N frames.
         latents: [N, Z] of an imputation.
-        shots: (row of the signals, camera of the renderer's film size), one a picture.
-        renderer: of that size.
+        shots: (row of the signals, camera), one a picture; a picture has its camera's size.
+        renderer: of a film that holds the largest of them (`captures.cameras.film_size`).
         occlusion: baker at the avatar's shadow size.
         clock: is told what each part took.
     """
@@ -103,8 +103,9 @@ def animate(
                 output = avatar.decode(theta, root, face, z, batch.centers[None].to(device), share)
             with clock.timed("rendering"):
                 radiance, mask = renderer.render(output.vertices, output.textures.flatten(0, 1), batch, seed=row)
-                picture, coverage = radiance[0].permute(1, 2, 0).cpu().numpy(), mask[0, 0].cpu().numpy()
-        yield AnimatedFrame(row, output.vertices[0].cpu(), np.ascontiguousarray(picture), coverage)
+                seen = (slice(camera.height), slice(camera.width))
+                picture, coverage = radiance[0].permute(1, 2, 0)[seen].cpu().numpy(), mask[0, 0][seen].cpu().numpy()
+        yield AnimatedFrame(row, output.vertices[0].cpu(), np.ascontiguousarray(picture), np.ascontiguousarray(coverage))
 
 
 @torch.no_grad()

@@ -67,7 +67,7 @@ class ViewPainter:
 
     Attributes:
         playback: the avatar and its frames.
-        renderer: of the pictures' size; draws radiance as captured, and the layers.
+        renderer: of a film that holds the largest picture of the path; draws radiance as captured, and the layers.
         albedo: [3, T, T]; None leaves the layer out.
         tracer: of a lit scene; None draws radiance as captured.
         budget: of samples, for the tracer.
@@ -86,7 +86,10 @@ class ViewPainter:
             ValueError: relighting without an albedo.
         """
         posed = self.playback.pose(view.frame, view.camera.center_world[None], view.turn)
+        seen = (slice(view.camera.height), slice(view.camera.width))
         radiance, mask, layers = self._surface(view, posed, has_layers)
+        radiance, mask = np.ascontiguousarray(radiance[seen]), np.ascontiguousarray(mask[seen])
+        layers = {name: np.ascontiguousarray(layer[seen]) for name, layer in layers.items()}
         comments = f"samples {self.renderer.samples_per_pixel}"
         if self.tracer is not None:
             self._place(posed)

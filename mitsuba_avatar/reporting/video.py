@@ -54,6 +54,15 @@ def write_video(path: Path | str, frames: Iterable[UInt8[np.ndarray, "H W 3"]], 
     return count
 
 
+def centred(picture: UInt8[np.ndarray, "h w 3"], width: int, height: int, colour: UInt8[np.ndarray, "3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture in the middle of a larger one of one colour: frames of several sizes make a video of the largest."""
+    larger = np.empty((height, width, 3), np.uint8)
+    larger[:] = colour
+    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    larger[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+    return larger
+
+
 def _video_stream(container: av.container.OutputContainer, shape: tuple[int, ...], fps: float, quality: int) -> av.VideoStream:
     try:
         stream = container.add_stream(_CODEC, rate=Fraction(fps).limit_denominator(1001))

@@ -60,6 +60,10 @@ class ViewTransform:
         straight = scene / np.maximum(coverage[..., None], np.float32(1e-6))  # where nothing is seen there is no colour to restore
         return np.concatenate([to_bytes(self._shown(straight)), to_bytes(coverage[..., None])], axis=2)
 
+    def backdrop_bytes(self) -> UInt8[np.ndarray, "3"]:
+        """What `apply` shows where nobody is; black without a backdrop."""
+        return to_bytes(self._shown(np.full((1, 1, 3), self.backdrop or 0.0, np.float32)))[0, 0]
+
     def describe(self) -> str:
         """What a file's text chunk says."""
         return f"{self.name}, exposure {self.exposure:g} stops, backdrop {'none' if self.backdrop is None else f'{self.backdrop:g}'}"

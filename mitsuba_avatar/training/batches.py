@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mitsuba_avatar.captures.arrays import FRAME_ARRAYS
+from mitsuba_avatar.captures.cameras import film_size
 from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.captures.folder import CAMERAS_FILE, Capture
 from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
@@ -108,8 +109,7 @@ class FrameReader:
     def __init__(self, capture: Capture, occlusion: FrameOcclusion):
         check_readable(capture)
         self.capture, self.occlusion = capture, occlusion
-        self.width = max(camera.width for camera in capture.cameras.values())
-        self.height = max(camera.height for camera in capture.cameras.values())
+        self.width, self.height = film_size(capture.cameras.values())
 
     def read(self, frames: list[int], camera_names: list[list[str]]) -> FrameBatch:
         """Decode the images of P frames, N cameras each; raises what `Capture.image` raises, naming the file."""
