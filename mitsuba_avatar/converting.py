@@ -49,7 +49,7 @@ class ConvertCommand:
         image_extension: Of the images to write; default: as the source's.
         fps: Frames per second; default: the format's.
         test_frames: So many of the last frames are for testing; default: the data set's own split, else a tenth.
-        up: Axis of the data set's world that points up; default: as the cameras stand.
+        up: Axis of the data set's world that points up; default: the one along which the cameras stand ("cameras": just as they stand).
         distortion: Apply or ignore the stored lens coefficients; default: as the data set's own tools do.
         assets: Body model of Goliath captures (static_assets_body.pt or .npz); default: in or beside the capture.
         own_sizes: Keep the size of each camera's images; default: all become as small as the smallest.

@@ -17,7 +17,8 @@ from jaxtyping import Float, Float64
 from mitsuba_avatar.captures.rigid import inverse_rigid, is_rigid
 from mitsuba_avatar.files import atomic_path
 
-UpAxis = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]  # of a world that is not ours yet
+# Which way is up in a world that is not ours yet: one of its axes, as the cameras stand, or the axis that they stand along.
+UpAxis = Literal["auto", "cameras", "x", "-x", "y", "-y", "z", "-z"]
 
 FORMAT_VERSION = 1
 LARGEST_RIG_METRES = 100.0  # no capture stage is larger; 3 m domes in centimetres or millimetres are
@@ -34,8 +35,8 @@ class Camera:
         fx, fy: focal lengths in pixels, positive.
         cx, cy: principal point in pixels, origin at the image's corner.
         camera_from_world: [4, 4] rigid, metres.
-        distortion: empty, or OpenCV's radial-tangential (k1, k2, p1, p2) or (k1, k2, p1, p2, k3). `project` applies it; renderers
-            take undistorted cameras only.
+        distortion: empty, or OpenCV's radial-tangential (k1, k2, p1, p2[, k3[, k4, k5, k6]]), where k4 to k6 are the rational
+            model's. `project` applies it; renderers take undistorted cameras only.
 
     Raises:
         ValueError: for a size or focal length that is not positive, a matrix that is not rigid, or another count of coefficients.
@@ -69,9 +70,9 @@ class Camera:
                 f"0 0 0 1); got {self.camera_from_world.tolist()}. Divide out the scale; a matrix stored transposed has its translation "
                 "in the last row."
             )
-        if len(self.distortion) not in (0, 4, 5) or not np.isfinite(self.distortion).all():
+        if len(self.distortion) not in (0, 4, 5, 8) or not np.isfinite(self.distortion).all():
             raise ValueError(
-                f"Camera(): distortion of {self.name} must be empty or (k1, k2, p1, p2[, k3]); got {self.distortion}. "
+                f"Camera(): distortion of {self.name} must be empty or (k1, k2, p1, p2[, k3[, k4, k5, k6]]); got {self.distortion}. "
                 "Undistort the images of other lens models first."
             )
 
@@ -117,11 +118,12 @@ class Camera:
         )
 
     def _distort(self, normalized: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        """Brown-Conrady model on coordinates [N, 2] in the plane at depth 1."""
-        k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
+        """Brown-Conrady model, rational where there are k4 to k6, on coordinates [N, 2] in the plane at depth 1."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, 0.0, 0.0, 0.0, 0.0)[:8]
         x, y = normalized[:, 0], normalized[:, 1]
         squared_radius = x * x + y * y
         radial = 1 + squared_radius * (k1 + squared_radius * (k2 + squared_radius * k3))
+        radial = radial / (1 + squared_radius * (k4 + squared_radius * (k5 + squared_radius * k6)))
         bent_x = x * radial + 2 * p1 * x * y + p2 * (squared_radius + 2 * x * x)
         bent_y = y * radial + p1 * (squared_radius + 2 * y * y) + 2 * p2 * x * y
         return np.stack([bent_x, bent_y], axis=-1)

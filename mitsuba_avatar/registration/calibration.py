@@ -4,7 +4,7 @@
 |---|---|---|
 | cameras.json | captures/cameras.py | metres, Z up |
 | *.qca.txt | Qualisys Track Manager | millimetres, Z up |
-| intri.yml, extri.yml | OpenCV's FileStorage, as EasyMocap names its entries | of the checkerboard, in metres; up as the cameras stand |
+| intri.yml, extri.yml | OpenCV's FileStorage, as EasyMocap names its entries | of the checkerboard, metres; up along the cameras |
 | cameras.txt, images.txt | COLMAP (also in sparse/0 or sparse) | unknown: must be told; up as the cameras stand |
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from mitsuba_avatar.captures.cameras import Camera, load_cameras
 from mitsuba_avatar.captures.folder import CAMERAS_FILE
 from mitsuba_avatar.captures.formats import colmap, easymocap
-from mitsuba_avatar.captures.formats.source import turned_camera, upright_world
+from mitsuba_avatar.captures.formats.source import SURE_ANGLE_DEG, degrees_off, turned_camera, upright_world
 from mitsuba_avatar.registration.qualisys import load_qualisys
 from mitsuba_avatar.registration.settings import CalibrationSettings
 
@@ -34,7 +34,7 @@ class Calibration:
         read: takes (width, height) of the videos by name, for formats that do not say the images' size; gives cameras in the files'
             own world.
         is_upright: whether that world's Z points up.
-        has_unit: whether its unit is known.
+        has_unit: whether its unit is known, and its axes mean anything.
     """
 
     path: Path
@@ -60,7 +60,14 @@ class Calibration:
             cameras = {name: colmap.scaled_camera(camera, settings.metres) for name, camera in cameras.items()}
         if self.is_upright and settings.up == "auto":
             return cameras
-        turn = upright_world(cameras.values(), settings.up, self.path)
+        turn = upright_world(cameras.values(), settings.up, self.path, has_axes=self.has_unit)
+        off = degrees_off(cameras.values(), turn, self.path) if settings.up == "auto" else 0.0
+        if off > SURE_ANGLE_DEG:
+            raise ValueError(
+                f"Calibration(): expected cameras that stand along an axis of the world of {self.path}, to tell which way is up; got "
+                f"{off:.0f} degrees off the nearest. Say calibration.up=z (or the axis that points up), or calibration.up=cameras to take "
+                "up as they stand."
+            )
         return {name: turned_camera(camera, turn) for name, camera in cameras.items()}
 
 

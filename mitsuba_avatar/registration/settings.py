@@ -18,7 +18,7 @@ KeypointOrder = Literal["auto", "body_25", "body_25b", "coco", "openpose_coco", 
 class CalibrationSettings:
     """What a calibration's files may leave open."""
 
-    up: UpAxis = "auto"  # axis of its world that points up; auto: as the format says, else as the cameras stand
+    up: UpAxis = "auto"  # axis of its world that points up; cameras: as they stand; auto: as the format says, else along them
     metres: float = 0.0  # in a unit of its world; 0: as the format says (COLMAP's has no unit)
 
     def __post_init__(self) -> None:

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
@@ -42,6 +43,17 @@ def test_distortion_follows_opencv_model():
     assert camera.is_distorted and not upright_camera().is_distorted and not upright_camera(distortion=(0.0,) * 4).is_distorted
 
 
+@pytest.mark.parametrize("count", [4, 5, 8])
+def test_distortion_is_opencv_s_projection(count):
+    coefficients = (0.3, -0.1, 0.01, -0.02, 0.05, 0.4, -0.05, 0.02)[:count]
+    camera = upright_camera(distortion=coefficients)
+    points = np.random.default_rng(3).uniform(-0.4, 0.4, (20, 3)) + camera.world_from_camera[:3, 2] * 2 + camera.center_world
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    turn, shift = cv2.Rodrigues(camera.camera_from_world[:3, :3])[0], camera.camera_from_world[:3, 3]
+    expected = cv2.projectPoints(points, turn, shift, matrix, np.array(coefficients))[0][:, 0]
+    np.testing.assert_allclose(camera.project(points)[0], expected, atol=1e-9)
+
+
 def test_resized_camera_projects_to_the_same_place():
     """Rounded sizes are followed exactly: 64x48 by 0.4 is 26x19, not 25.6x19.2."""
     camera = upright_camera()
@@ -70,7 +82,7 @@ def test_round_trip_keeps_order_and_every_digit(tmp_path):
         ({"fx": -80.0}, r"positive focal lengths.*got fx=-80.0"),
         ({"cy": float("nan")}, r"finite principal point"),
         ({"name": "a/b"}, r"a name that can be a folder's; got 'a/b'"),
-        ({"distortion": (0.1,)}, r"distortion of a must be empty or \(k1, k2, p1, p2"),
+        ({"distortion": (0.1,) * 6}, r"distortion of a must be empty or \(k1, k2, p1, p2"),
         ({"camera_from_world": np.diag([2.0, 2, 2, 1])}, r"camera_from_world of a must be a rigid 4x4.*Divide out the scale"),
         ({"camera_from_world": np.diag([1.0, 1, -1, 1])}, r"without scale or mirror"),
         ({"camera_from_world": np.full((4, 4), np.nan)}, r"must be a rigid 4x4"),

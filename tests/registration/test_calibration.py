@@ -14,19 +14,20 @@ from tests.registration.people_in_cameras import make_cameras, standing_person
 
 WIDTH, HEIGHT = 270, 480
 LENS = {"SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": (-0.08,), "RADIAL": (-0.08, 0.02), "OPENCV": (-0.08, 0.02, 1e-3, -2e-3)}
+LENS["FULL_OPENCV"] = (0.3, -0.1, 1e-3, -2e-3, 0.02, 0.4, -0.05, 0.01)
 Y_DOWN = Rotation.from_euler("x", 90, degrees=True).as_matrix()  # native_from_ours: our Z is the reconstruction's -Y
 UNIT = 0.37  # metres in a unit of the reconstruction
 
 
-def native_pose(camera: Camera, unit: float = 1.0) -> np.ndarray:
-    """camera_from_native [4, 4] in a world whose Y points down and whose unit is `unit` metres long."""
+def native_pose(camera: Camera, unit: float = 1.0, tilt: float = 0.0) -> np.ndarray:
+    """camera_from_native [4, 4] in a world whose Y points down, but for `tilt` degrees, and whose unit is `unit` metres long."""
     pose = camera.camera_from_world.copy()
-    pose[:3, :3] = pose[:3, :3] @ Y_DOWN.T
+    pose[:3, :3] = pose[:3, :3] @ Y_DOWN.T @ Rotation.from_euler("zx", [tilt, 0.3 * tilt], degrees=True).as_matrix()
     pose[:3, 3] /= unit
     return pose
 
 
-def write_colmap(folder: Path, model: str, name: str = "{}.jpg") -> dict[str, Camera]:
+def write_colmap(folder: Path, model: str, name: str = "{}.jpg", tilt: float = 0.0) -> dict[str, Camera]:
     """cameras.txt and images.txt of three cameras; returns what they stand for."""
     cameras = {key: camera for key, camera in make_cameras(WIDTH, HEIGHT).items() if key != "d"}
     lens_lines, image_lines, expected = ["# Camera list"], ["# Image list with two lines of data per image:"], {}
@@ -35,11 +36,11 @@ def write_colmap(folder: Path, model: str, name: str = "{}.jpg") -> dict[str, Ca
         focal = (camera.fx,) if has_one_focal else (camera.fx, camera.fy)
         values = " ".join(repr(float(value)) for value in (*focal, camera.cx, camera.cy, *LENS[model]))
         lens_lines.append(f"{index + 1} {model} {WIDTH} {HEIGHT} {values}")
-        pose = native_pose(camera, UNIT)
+        pose = native_pose(camera, UNIT, tilt)
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
         numbers = " ".join(repr(float(value)) for value in (w, x, y, z, *pose[:3, 3]))
         image_lines += [f"{7 - index} {numbers} {index + 1} {name.format(key)}", "12.5 40.0 -1 13.0 41.5 3" if index else ""]
-        coefficients = tuple((*LENS[model], 0.0, 0.0, 0.0, 0.0)[:4]) if any(LENS[model]) else ()
+        coefficients = tuple((*LENS[model], 0.0, 0.0, 0.0, 0.0)[: max(4, len(LENS[model]))]) if any(LENS[model]) else ()
         expected[key] = Camera(
             key, WIDTH, HEIGHT, camera.fx, focal[-1], camera.cx, camera.cy, camera.camera_from_world, distortion=coefficients
         )
@@ -49,16 +50,16 @@ def write_colmap(folder: Path, model: str, name: str = "{}.jpg") -> dict[str, Ca
     return expected
 
 
-def write_opencv(folder: Path, has_sizes: bool = True) -> dict[str, Camera]:
+def write_opencv(folder: Path, has_sizes: bool = True, lens: tuple = (*LENS["OPENCV"], 0.003), tilt: float = 0.0) -> dict[str, Camera]:
     """intri.yml and extri.yml: bent cameras, pixel centres at integers, a world whose Y points down."""
     expected, intrinsics, extrinsics = {}, {"names": ["a", "b"]}, {"names": ["a", "b"]}
     for name in ("a", "b"):
         camera = make_cameras(WIDTH, HEIGHT)[name]
-        coefficients = (*LENS["OPENCV"], 0.003)
+        coefficients = lens
         matrix = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
         intrinsics |= {f"K_{name}": matrix, f"dist_{name}": np.array([coefficients])}
         intrinsics |= {f"H_{name}": HEIGHT, f"W_{name}": WIDTH} if has_sizes else {}
-        pose = native_pose(camera)
+        pose = native_pose(camera, tilt=tilt)
         extrinsics |= {f"R_{name}": Rotation.from_matrix(pose[:3, :3]).as_rotvec()[:, None], f"T_{name}": pose[:3, 3:]}
         expected[name] = Camera(
             name, WIDTH, HEIGHT, camera.fx, camera.fy, camera.cx, camera.cy, camera.camera_from_world, distortion=coefficients
@@ -103,6 +104,45 @@ def test_a_unit_that_nobody_named_is_asked_for(tmp_path):
 def test_opencv_cameras_project_as_they_were_written(tmp_path):
     expected = write_opencv(tmp_path)
     assert_same_views(find_calibration(tmp_path).cameras({}, CalibrationSettings()), expected)
+
+
+def test_opencv_s_rational_lenses_are_read_and_its_thin_prisms_refused(tmp_path):
+    expected = write_opencv(tmp_path, lens=LENS["FULL_OPENCV"])
+    assert_same_views(find_calibration(tmp_path).cameras({}, CalibrationSettings()), expected)
+    text = (tmp_path / "intri.yml").read_text()
+    longer = (*LENS["FULL_OPENCV"], 0.1, 0.0, 0.0, 0.0)
+    (tmp_path / "intri.yml").write_text(
+        text.replace("cols: 8", "cols: 12").replace("0.01 ]", ", ".join(map(str, (0.01, *longer[8:]))) + " ]")
+    )
+    with pytest.raises(ValueError, match="at most k1, k2, p1, p2, k3, k4, k5, k6 of a .*got 12 coefficients. Calibrate without the thin"):
+        find_calibration(tmp_path).cameras({}, CalibrationSettings())
+
+
+def assert_upright_and_rigid(cameras: dict[str, Camera], expected: dict[str, Camera]) -> None:
+    """The world stands upright at the right height, turned about Z at most: nothing between cameras has changed."""
+    heights = [[camera.center_world[2] for camera in each.values()] for each in (cameras, expected)]
+    np.testing.assert_allclose(np.diff(heights[0]), np.diff(heights[1]), atol=1e-6)
+    names = list(expected)
+    for first, second in zip(names, names[1:], strict=False):
+        between = [each[first].camera_from_world @ each[second].world_from_camera for each in (cameras, expected)]
+        np.testing.assert_allclose(*between, atol=1e-6)
+
+
+@pytest.mark.parametrize("tilt", [10.0, 25.0])
+def test_a_world_without_axes_is_turned_as_its_cameras_stand_and_never_snapped(tilt, tmp_path):
+    """All cameras look down, and none is opposite another: their mean up would be off, their horizontal axes are not."""
+    expected = write_colmap(tmp_path, "PINHOLE", tilt=tilt)
+    assert_upright_and_rigid(find_calibration(tmp_path).cameras({}, CalibrationSettings(metres=UNIT)), expected)
+
+
+def test_a_board_that_lay_ten_degrees_off_is_asked_about(tmp_path):
+    expected = write_opencv(tmp_path, tilt=10.0)
+    with pytest.raises(ValueError, match="to tell which way is up; got 10 degrees off the nearest. Say calibration.up=z"):
+        find_calibration(tmp_path).cameras({}, CalibrationSettings())
+    assert_upright_and_rigid(find_calibration(tmp_path).cameras({}, CalibrationSettings(up="cameras")), expected)
+    leaning = find_calibration(tmp_path).cameras({}, CalibrationSettings(up="-y"))
+    between = [each["a"].camera_from_world @ each["b"].world_from_camera for each in (leaning, expected)]
+    np.testing.assert_allclose(*between, atol=1e-6, err_msg="the axis that the user names is taken, and nothing between cameras changes")
 
 
 def test_opencv_cameras_without_a_size_take_the_videos(tmp_path):

@@ -25,7 +25,9 @@ PARAMETERS: Mapping[str, Sequence[str]] = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 def read_colmap(folder: Path) -> dict[str, Camera]:
@@ -103,7 +105,7 @@ def _camera(words: Sequence[str], lenses: Mapping[str, tuple[int, int, dict[str,
             f"read_colmap(): expected 'IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME' of a camera in {CAMERAS_FILE} in {path}; got "
             f"{' '.join(words)[:60]!r}. {CONVERSION}"
         ) from error
-    coefficients = tuple(values.get(key, 0.0) for key in ("k1", "k2", "p1", "p2"))
+    coefficients = tuple(values.get(key, 0.0) for key in _COEFFICIENTS[: 8 if "k6" in values else 4])
     return Camera(
         image.parts[0] if len(image.parts) > 1 else image.stem,
         width,

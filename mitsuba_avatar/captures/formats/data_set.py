@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from mitsuba_avatar.captures.cameras import Camera
-from mitsuba_avatar.captures.formats.source import MissingFrame, SourceInfo, SourceOptions, timed_frames, turned_camera
+from mitsuba_avatar.captures.formats.source import MissingFrame, SourceInfo, SourceOptions, timed_frames, turned_camera, up_notes
 from mitsuba_avatar.captures.images import ImageExtension
 from mitsuba_avatar.captures.undistortion import Lens
 
@@ -74,7 +74,7 @@ class DataSet:
             image_extension=contents.image_extension,
             has_masks=contents.has_masks,
             lacks=(f"the body: rig.npz, pose.npy, root.npy, face.npy, vertices.npy ({self.body})",),
-            notes=tuple(contents.notes),
+            notes=(*contents.notes, *up_notes(contents.native.values(), contents.world_from_native, options, path)),
             licence=self.licence,
             source=f"{self.name} {'/'.join(parts)}",
         )

@@ -37,6 +37,7 @@ from mitsuba_avatar.captures.undistortion import Lens
 
 INTRINSICS_FILE = "intri.yml"
 EXTRINSICS_FILE = "extri.yml"
+RATIONAL_COUNT = 8  # coefficients that a camera can hold
 DATA_SET = DataSet("EasyMocap folder", 30.0, "SMPL parameters are no rig of ours")
 MASK_FOLDERS = ("mask", "masks", "mask_cihp", "mask-schp")
 
@@ -127,7 +128,7 @@ def read_easymocap_cameras(path: Path, sizes: Mapping[str, tuple[int, int]]) -> 
 
     Raises:
         FileNotFoundError: if either file is missing.
-        ValueError: for files of another schema, no camera that both name, or a lens with more than five coefficients.
+        ValueError: for files of another schema, no camera that both name, or a lens with more than eight coefficients.
     """
     calibrated, intrinsics, extrinsics = _calibration(path)
     if not calibrated:
@@ -142,13 +143,13 @@ def read_easymocap_cameras(path: Path, sizes: Mapping[str, tuple[int, int]]) -> 
         if size is None:
             continue
         lens = _lens(name, intrinsics, path)
-        if any(lens.coefficients[5:]):
+        if any(lens.coefficients[RATIONAL_COUNT:]):
             raise ValueError(
-                f"read_easymocap_cameras(): expected at most k1, k2, p1, p2, k3 of {name} in {path / INTRINSICS_FILE}; got "
-                f"{len(lens.coefficients)} coefficients. Calibrate without the rational model."
+                f"read_easymocap_cameras(): expected at most k1, k2, p1, p2, k3, k4, k5, k6 of {name} in {path / INTRINSICS_FILE}; got "
+                f"{len(lens.coefficients)} coefficients. Calibrate without the thin-prism and tilted models."
             )
         camera = _camera(name, intrinsics, extrinsics, size, path)
-        cameras[name] = camera if lens.is_pinhole else replace(camera, distortion=lens.coefficients[:5])
+        cameras[name] = camera if lens.is_pinhole else replace(camera, distortion=lens.coefficients[:RATIONAL_COUNT])
     return cameras
 
 

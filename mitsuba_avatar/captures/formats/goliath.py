@@ -41,6 +41,7 @@ from mitsuba_avatar.captures.formats.source import (
     timed_frames,
     turned_camera,
     turned_points,
+    up_notes,
     upright_world,
 )
 from mitsuba_avatar.captures.frames import Frame
@@ -109,7 +110,7 @@ class GoliathSource(Source):
             image_extension="avif",
             has_masks=bool(self._parts),
             lacks=tuple(lacks),
-            notes=(*notes, *([problem] if problem else [])),
+            notes=(*notes, *up_notes(native.values(), turn, options, self.path), *([problem] if problem else [])),
             keypoint_names=tuple(ids),
             licence=LICENCE,
             source=f"Goliath body capture {self.path.resolve().name}",

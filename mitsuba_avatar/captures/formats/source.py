@@ -23,7 +23,9 @@ from mitsuba_avatar.captures.images import ImageExtension
 from mitsuba_avatar.captures.undistortion import Lens
 
 LEAST_UPRIGHT = 0.4  # length of the cameras' mean up direction; below it they are rolled, or look from below as much as from above
-SNAP_ANGLE_DEG = 35.0  # the world's up is one of its axes if the cameras' mean up is as near to it as this
+LEAST_SPREAD = 0.1  # mean square of the cameras' horizontal axes along their second direction; below it they all look the same way
+SNAP_ANGLE_DEG = 35.0  # the world's up is one of its axes if the cameras stand as near to it as this: hands, and heads, roll a little
+SURE_ANGLE_DEG = 5.0  # as far off, nobody need be told
 TEST_SHARE = 0.1  # of the frames, where neither the data set nor the user says which are for testing
 
 
@@ -35,7 +37,7 @@ class SourceOptions:
         cameras: read only these; all of them must be there. Empty reads all that have calibration and images.
         fps: frames per second; 0 takes what the format or its documentation says.
         test_frames: so many of the last frames are for testing; -1 takes the data set's own split, or else a tenth.
-        up: axis of the data set's world that points up; "auto" asks the cameras.
+        up: axis of the data set's world that points up; "auto" takes that along which the cameras stand, "cameras" as they stand.
         distortion: "apply" the stored lens coefficients, "ignore" them, or do as the data set's own tools do ("auto").
         assets: file of the body model, for formats that keep it elsewhere.
         images_only: leave out what takes long to list and has nothing to do with images (names of keypoints).
@@ -242,28 +244,67 @@ def timed_frames(
     return tuple(frames)
 
 
-def upright_world(cameras: Iterable[Camera], up: UpAxis, where: Path) -> Float64[np.ndarray, "4 4"]:
+def upright_world(cameras: Iterable[Camera], up: UpAxis, where: Path, has_axes: bool = True) -> Float64[np.ndarray, "4 4"]:
     """Rotation [4, 4] that carries a data set's world to one whose Z points up.
+
+    Args:
+        cameras: in that world.
+        up: "auto" takes the world's axis that is nearest to up as the cameras stand, or that direction itself where no axis is near.
+        where: for messages.
+        has_axes: whether the world's axes mean anything; where not, "auto" is as "cameras".
 
     Raises:
         ValueError: if the cameras do not tell which way is up.
     """
-    if up != "auto":
+    if up in ("auto", "cameras"):
+        direction = cameras_up(cameras, where)
+        axis = int(np.abs(direction).argmax())
+        if up == "auto" and has_axes and abs(direction[axis]) > np.cos(np.deg2rad(SNAP_ANGLE_DEG)):
+            direction = np.sign(direction[axis]) * np.eye(3)[axis]
+    else:
         direction = np.zeros(3)
         direction["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
-        return _rotation_to_z(direction)
-    direction = np.mean([-camera.camera_from_world[1, :3] for camera in cameras], axis=0)
-    length = float(np.linalg.norm(direction))
+    return _rotation_to_z(direction)
+
+
+def cameras_up(cameras: Iterable[Camera], where: Path) -> Float64[np.ndarray, "3"]:
+    """Unit vector that points up as the cameras stand: upright to their horizontal axes, however far they look down.
+
+    Where all look the same way, and their horizontal axes leave it open, the mean of their own up directions.
+
+    Raises:
+        ValueError: if the cameras do not tell which way is up.
+    """
+    rotations = np.stack([camera.camera_from_world[:3, :3] for camera in cameras])
+    mean = -rotations[:, 1].mean(axis=0)
+    length = float(np.linalg.norm(mean))
     if length < LEAST_UPRIGHT:
         raise ValueError(
             f"upright_world(): expected cameras that stand upright, to tell which way is up in {where}; got a mean up direction of "
             f"length {length:.2f}. Say which axis points up (--up z, say; calibration.up=z for register)."
         )
-    direction /= length
-    axis = int(np.abs(direction).argmax())
-    if abs(direction[axis]) > np.cos(np.deg2rad(SNAP_ANGLE_DEG)):
-        direction = np.sign(direction[axis]) * np.eye(3)[axis]
-    return _rotation_to_z(direction)
+    horizontal = rotations[:, 0]
+    values, vectors = np.linalg.eigh(horizontal.T @ horizontal / len(horizontal))
+    if values[1] < LEAST_SPREAD:
+        return mean / length
+    return vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
+
+
+def degrees_off(cameras: Iterable[Camera], world_from_native: Float64[np.ndarray, "4 4"], where: Path) -> float:
+    """Degrees between the turned world's up and up as the cameras stand in the world that it is turned from."""
+    return float(np.rad2deg(np.arccos(np.clip(world_from_native[2, :3] @ cameras_up(cameras, where), -1.0, 1.0))))
+
+
+def up_notes(
+    native: Iterable[Camera], world_from_native: Float64[np.ndarray, "4 4"], options: SourceOptions, where: Path
+) -> tuple[str, ...]:
+    """What a user should know about the axis that was taken for up: nothing where the cameras stand along it."""
+    off = degrees_off(native, world_from_native, where) if options.up == "auto" else 0.0
+    if off <= SURE_ANGLE_DEG:
+        return ()
+    up = world_from_native[2, :3]
+    axis = ("-" if up.min() < -0.5 else "") + "xyz"[int(np.abs(up).argmax())]
+    return (f"{axis} was taken for up, though the cameras stand {off:.0f} degrees off it (--up names an axis, --up cameras takes theirs)",)
 
 
 def turned_camera(camera: Camera, world_from_native: Float[np.ndarray, "4 4"]) -> Camera:

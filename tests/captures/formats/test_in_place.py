@@ -163,7 +163,7 @@ def test_names_of_captures(tmp_path, monkeypatch):
         ("images_from: elsewhere", r"Expected images_from with format and path; got 'elsewhere'"),
         ("images_from: {format: zju, path: a, stat: 1}", r"got 'stat'. Did you mean 'state'"),
         ("images_from: {format: zju, path: a, has_masks: 3}", r"Expected has_masks to be true or false; got 3"),
-        ("images_from: {format: zju, path: a, up: w}", r"Expected up to be one of auto, x"),
+        ("images_from: {format: zju, path: a, up: w}", r"Expected up to be one of auto, cameras, x"),
     ],
 )
 def test_a_description_that_cannot_be_read_is_named(captured, written, message):

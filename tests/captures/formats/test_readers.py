@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from mitsuba_avatar.captures.colour import encode_bytes
 from mitsuba_avatar.captures.formats.conversion import ConversionOptions, convert, read_report
@@ -277,6 +278,29 @@ def test_cameras_that_do_not_stand_upright_ask_which_way_is_up(data_sets):
         turn[1, 1] = turn[2, 2] = -1
         cameras = list(source.info.cameras.values())
         upright_world([*cameras, *(turned_camera(camera, turn) for camera in cameras)], "auto", data_sets["actorshq"][0])
+
+
+def test_an_axis_that_the_cameras_do_not_stand_along_is_taken_but_not_silently(data_sets, tmp_path):
+    """A board that leant: the data set's axis is kept, as its users expect, and the user is told how far the cameras are off."""
+    path, scene = data_sets["easymocap"]
+    assert not open_source("easymocap", path).info.notes
+    shutil.copytree(path, tmp_path / "leaning")
+    lean = Rotation.from_euler("xz", [9.0, 4.0], degrees=True).as_matrix()
+    entries = read_opencv_yaml(path / "extri.yml")
+    for name in entries["names"]:
+        rotation = (
+            entries[f"Rot_{name}"] if f"Rot_{name}" in entries else Rotation.from_rotvec(entries[f"R_{name}"].ravel()).as_matrix()
+        ) @ lean
+        entries |= {f"Rot_{name}": rotation, f"R_{name}": Rotation.from_matrix(rotation).as_rotvec()[:, None]}
+    (tmp_path / "leaning/extri.yml").write_text(opencv_yaml_text(entries))
+    (note,) = open_source("easymocap", tmp_path / "leaning").info.notes
+    assert "was taken for up, though the cameras stand" in note and "--up cameras" in note
+    upright = open_source("easymocap", tmp_path / "leaning", SourceOptions(up="cameras")).info
+    assert not upright.notes
+    first, second = list(scene.cameras)[:2]
+    for info in (upright, open_source("easymocap", tmp_path / "leaning").info):
+        between = [each[first].camera_from_world @ each[second].world_from_camera for each in (info.cameras, scene.cameras)]
+        np.testing.assert_allclose(*between, atol=1e-6)
 
 
 def test_opencv_yaml_comes_back_as_it_was_written(tmp_path):
