@@ -53,8 +53,8 @@ def find_person(
         progress: called as progress(done, total).
 
     Raises:
-        FileNotFoundError, ValueError: files, as `read_people`; nobody is seen, or people cross, as `follow_person`; a video
-            is out of step, as `require_synchronized`; no order makes a body.
+        FileNotFoundError, ValueError: files, as `read_people`; nobody is seen, or not by some camera; people cross, as
+            `follow_person`; a video is out of step, as `require_synchronized`; no order makes a body.
     """
     views = list(recording.views.values())
     targets = list(cameras.values())
@@ -70,11 +70,19 @@ def find_person(
             f"find_person(): expected people in the keypoint files of {recording.path}; got nobody in any frame of any camera. "
             "Detect keypoints with a lower threshold, or check that the files are those of these videos."
         )
+    blind = [name for index, name in enumerate(cameras) if not any(len(frame[index]) for frame in detections)]
+    if blind:
+        raise ValueError(
+            f"find_person(): expected people in the keypoint files of every camera of {recording.path}; got nobody in any frame of "
+            f"{blind}. Detect keypoints in these videos again, or take them away: a camera that never sees the person is of no use."
+        )
     if len(lengths) > 1:
         raise ValueError(
             f"find_person(): expected one keypoint order in all files of {recording.path}; got {sorted(lengths)} points. "
             "Run one detector on all videos."
         )
+    nobody = np.zeros((0, lengths.pop(), 3))
+    detections = [[people if len(people) else nobody for people in frame] for frame in detections]
     # Points are grouped and followed before their names are known: the numbers alone say which belong together.
     followed = follow_person(targets, detections, recording.fps, limits)
     if settings.checks_synchronization:
@@ -123,6 +131,7 @@ def asymmetry(positions: Float[np.ndarray, "N K 4"]) -> float:
 def _straight(view: RecordedView, target: Camera, frame: int, settings: KeypointSettings) -> Float64[np.ndarray, "P points 3"]:
     """Detections of one image in pixels of the undistorted camera."""
     people = read_people(view.keypoints[frame], settings.least_confidence)
+    people = people[np.isfinite(people).any(axis=(1, 2))]  # some detectors write somebody without a single point
     if people.size:
         known = np.isfinite(people[..., 0])
         people[known, :2] = undistort_points(people[known][:, :2], view.camera, target=target)
