@@ -41,7 +41,7 @@ class BenchCommand:
     figure: Path | None = None  # draw the derivative of each pixel beside finite differences here, and time nothing
     noise: bool = False  # measure the noise of gradients at different sample counts instead
     bias: bool = False  # hold mean gradients against finite differences instead
-    rounds: int = 7  # turns of each contender; with --noise and --bias also seeds, ten a turn for ours
+    rounds: int = 7  # turns of each contender; --noise and --bias take so many times more seeds
     variant: str = "auto"  # Mitsuba variant
 
 
@@ -138,7 +138,7 @@ def write_noise_table(rig: Rig, rounds: int) -> None:
         "samples a pixel, an edge       ms   radiance     mask   radiance x sqrt(ms)   mask x sqrt(ms)\n"
     )
     for contender in swept:
-        row = measure_noise(contender, workload, 10 * rounds, times[contender.name])
+        row = measure_noise(contender, workload, 2 * rounds, times[contender.name])
         per_cent = [100 * value for value in (row.radiance, row.mask, row.at_equal_time(row.radiance), row.at_equal_time(row.mask))]
         sys.stdout.write(
             f"{row.name:>24} {row.milliseconds:8.1f} {per_cent[0]:10.2f} {per_cent[1]:8.2f} {per_cent[2]:21.1f} {per_cent[3]:17.1f}\n"

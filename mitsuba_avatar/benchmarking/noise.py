@@ -22,7 +22,7 @@ SETTINGS = ((1, 1), (1, 2), (1, 4), (2, 2), (4, 1), (4, 2), (4, 4), (4, 8), (16,
 ONE_PER_PIXEL = (1, 18)  # boundary samples as many as pixels, on the workload of `noise_workload`
 WIDTH, HEIGHT, VIEWS = 160, 256, 4
 CALLS = (1, 2, 4, 8, 16)  # consecutive ones that are averaged
-ORIENTATIONS = 6  # of the body: the noise of one depends on the random starts of few long edges
+ORIENTATIONS = 6  # of the body
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,17 @@ def projective_contender(workload: Workload) -> Contender:
     return Contender("direct_projective", peer.forward_and_backward, derivatives)
 
 
+def orientations(vertices: Float[Tensor, "P V 3"]) -> list[Float[Tensor, "P V 3"]]:
+    """The body turned about the vertical axis: the noise of one view depends on the random starts of few long edges and sharp texels."""
+    x, y, z = vertices.unbind(-1)
+    angles = torch.arange(ORIENTATIONS) * (2 * np.pi / ORIENTATIONS)
+    return [torch.stack([a.cos() * x - a.sin() * y, a.sin() * x + a.cos() * y, z], dim=-1) for a in angles]
+
+
 def measure_noise(contender: Contender, workload: Workload, repeats: int, milliseconds: float) -> NoiseRow:
-    """Deviations over `repeats` seeds, beside the time that a call takes."""
-    motions = body_motions(workload.vertices)
-    samples = np.stack([contender.derivatives(workload.vertices, motions, seed) for seed in range(1, repeats + 1)])
-    deviation = np.sqrt((samples.std(axis=0, ddof=1) ** 2).mean(axis=1)) / np.abs(samples.mean(axis=0)).max(axis=1)
-    return NoiseRow(contender.name, float(deviation[0]), float(deviation[1]), milliseconds)
+    """Deviations over `repeats` seeds of each orientation of the body, beside the time that a call takes."""
+    (radiance,), (mask,) = _deviations(contender, workload, repeats, calls=(1,))
+    return NoiseRow(contender.name, float(radiance), float(mask), milliseconds)
 
 
 def measure_averages(contender: Contender, workload: Workload, repeats: int) -> Float[np.ndarray, "2 N"]:
@@ -139,14 +144,16 @@ def measure_averages(contender: Contender, workload: Workload, repeats: int) -> 
     Args:
         repeats: means over the longest run of calls, for every orientation of the body.
     """
+    return _deviations(contender, workload, repeats * max(CALLS), CALLS)
+
+
+def _deviations(contender: Contender, workload: Workload, repeats: int, calls: tuple[int, ...]) -> Float[np.ndarray, "2 N"]:
+    """Root mean square over orientations and motions, as a share of each orientation's largest derivative."""
     squares = []
-    for k in range(ORIENTATIONS):
-        angle = torch.tensor(2 * np.pi * k / ORIENTATIONS)
-        x, y, z = workload.vertices.unbind(-1)
-        turned = torch.stack([angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y, z], dim=-1)
+    for turned in orientations(workload.vertices):
         motions = body_motions(turned)
-        samples = np.stack([contender.derivatives(turned, motions, seed) for seed in range(repeats * max(CALLS))])
+        samples = np.stack([contender.derivatives(turned, motions, seed) for seed in range(1, repeats + 1)])
         scale = np.abs(samples.mean(axis=0)).max(axis=1)
-        means = [samples.reshape(-1, calls, *samples.shape[1:]).mean(axis=1) for calls in CALLS]
-        squares.append([(mean.var(axis=0, ddof=1)).mean(axis=1) / scale**2 for mean in means])
+        means = [samples.reshape(-1, count, *samples.shape[1:]).mean(axis=1) for count in calls]
+        squares.append([mean.var(axis=0, ddof=1).mean(axis=1) / scale**2 for mean in means])
     return np.sqrt(np.mean(squares, axis=0)).T
