@@ -1,8 +1,9 @@
 """Writing a capture: every file whole or absent, resumable, and taken for a capture only once `finish` was called."""
 
+import itertools
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,11 @@ class CaptureWriter:
         """Whether this mask was written already."""
         return self._mask_path(camera_name, frame_index).is_file()
 
+    def has_all(self) -> bool:
+        """Whether every image and every mask was written already; found out at the first that was not, without asking file by file."""
+        missing = itertools.chain(self._missing(self._image_path), self._missing(self._mask_path))
+        return next(missing, None) is None
+
     def write_image(self, camera_name: str, frame_index: int, encoded: EncodedImage) -> None:
         """Write an image.
 
@@ -106,9 +112,9 @@ class CaptureWriter:
             ValueError: if the reader would refuse what was written; the capture stays unfinished.
         """
         if self.description.images_from is None:
-            self._require_all([self._image_path(name, index) for name in self.cameras for index in range(len(self.frames))], "images")
+            self._require_all(self._image_path, "images")
             if (self.path / MASKS_FOLDER).is_dir():
-                self._require_all([self._mask_path(name, index) for name in self.cameras for index in range(len(self.frames))], "masks")
+                self._require_all(self._mask_path, "masks")
         capture = Capture(self.path, self.description, self.cameras, self.frames)  # checks the arrays against frames and names
         capture.images.require()
         os.replace(self.path / UNFINISHED_FILE, self.path / DESCRIPTION_FILE)
@@ -139,13 +145,20 @@ class CaptureWriter:
             with atomic_path(self.path / name) as temporary:
                 temporary.write_text(texts[name], encoding="utf-8")
 
-    def _require_all(self, paths: list[Path], what: str) -> None:
-        """Refuse if some of the files are missing. Folders are listed once, not asked file by file."""
-        listed = {folder: set(os.listdir(folder)) if folder.is_dir() else set() for folder in {path.parent for path in paths}}
-        missing = [path for path in paths if path.name not in listed[path.parent]]
+    def _missing(self, path_of: Callable[[str, int], Path]) -> Iterator[Path]:
+        """Files that are not there, camera by camera. Folders are listed once; of millions of files, few names are in memory."""
+        names = [path_of(next(iter(self.cameras)), index).name for index in range(len(self.frames))]  # every camera's are alike
+        for camera in self.cameras:
+            folder = path_of(camera, 0).parent
+            listed = set(os.listdir(folder)) if folder.is_dir() else set()
+            yield from (folder / name for name in names if name not in listed)
+
+    def _require_all(self, path_of: Callable[[str, int], Path], what: str) -> None:
+        """Refuse if some of the files are missing."""
+        missing, total = list(self._missing(path_of)), len(self.cameras) * len(self.frames)
         if missing:
             raise FileNotFoundError(
-                f"CaptureWriter.finish(): expected {len(paths)} {what} in {self.path}; got {len(paths) - len(missing)}, the first missing "
+                f"CaptureWriter.finish(): expected {total} {what} in {self.path}; got {total - len(missing)}, the first missing "
                 f"is {missing[0]}. Write them, or leave their frame out."
             )
 

@@ -125,7 +125,7 @@ class _Filming:
                 film_charts(self.folder / "chart", self.dome.cameras, self.settings)
         finally:
             log_filming(self.folder / TRUTH_FOLDER, time.perf_counter() - started, made)
-        return self._finish() if self._is_all_there() else None
+        return self._finish() if self.writer.has_all() else None
 
     def _film(self) -> Iterator[int]:
         """Make the images that are missing; yields after each frame."""
@@ -172,10 +172,6 @@ class _Filming:
 
     def _has(self, camera: str, frame: int) -> bool:
         return self.writer.has_image(camera, frame) and self.writer.has_mask(camera, frame)
-
-    def _is_all_there(self) -> bool:
-        """Whether every image of every shard is made."""
-        return all(self._has(name, frame) for name in self.dome.cameras for frame in range(len(self.performance)))
 
     def _finish(self) -> Capture:
         """Arrays, rig, figures; then the capture is declared whole."""

@@ -29,6 +29,8 @@ from mitsuba_avatar.recordings.retargeting import retarget
 
 FOOT_LIFT = 0.05  # metres that a foot must leave the floor before it clearly no longer carries the person
 DISTANCE = np.radians(45.0)  # of the study's test poses from the nearest training pose, in the middle of a take; see `pose_distances`
+MOST_TRAINING, MOST_TEST = 10_000, 500  # poses that this distance is measured between; more change it by less than a degree
+AT_ONCE = 1024  # frames
 STILL = ("range", "slow", "held")  # styles in which the person hardly turns
 _FACES = {"resting": resting_face, "conversation": conversation_face, "expressions": expression_tour}
 
@@ -102,18 +104,25 @@ def plant_feet(rig: Rig, theta: Float32[np.ndarray, "N D"], root: Float32[np.nda
 
     Which foot stands is weighed smoothly by height. Heights are left alone: the surface, not the skeleton, stands on the floor.
     """
-    skeleton = Skeleton(rig)
-    with torch.no_grad():
-        joints = skeleton.posed_joints(skeleton(torch.from_numpy(theta), torch.from_numpy(root))).numpy()
     ankles = [rig.joint_names.index(f"foot.{side}") for side in "LR"]
-    clearance = joints[:, ankles, 2] - rig.joint_positions[ankles, 2]  # [N, 2] metres above standing height
+    skeleton, joints = Skeleton(rig), np.empty((len(theta), 2, 3), np.float32)
+    with torch.no_grad():
+        for part in parts_of(len(theta)):
+            transforms = skeleton(torch.from_numpy(theta[part]), torch.from_numpy(root[part]))
+            joints[part] = skeleton.posed_joints(transforms)[:, ankles].numpy()
+    clearance = joints[..., 2] - rig.joint_positions[ankles, 2]  # [N, 2] metres above standing height
     standing = np.exp(-(clearance - clearance.min(axis=1, keepdims=True)) / FOOT_LIFT)
     standing /= standing.sum(axis=1, keepdims=True)
     planted = np.einsum("nij,fj->nfi", root[:, :3, :3], rig.joint_positions[ankles]) + root[:, None, :3, 3]
-    slip = ((joints[:, ankles] - planted) * standing[..., None]).sum(axis=1)  # [N, 3]
+    slip = ((joints - planted) * standing[..., None]).sum(axis=1)  # [N, 3]
     shifted = root.copy()
     shifted[:, :2, 3] -= slip[:, :2]
     return shifted
+
+
+def parts_of(count: int) -> list[slice]:
+    """Runs of frames, one after the other, whose joints' transforms fit into memory together."""
+    return [slice(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE)]
 
 
 def _act(rig: Rig, settings: StudioSettings, action_names: Sequence[str], takes: tuple[Take, ...]) -> Motion:
@@ -187,20 +196,26 @@ def _training_poses(planned: Sequence[PlannedTake], theta: Sequence[np.ndarray])
 def _at_distance(rig: Rig, theta: Float[np.ndarray, "N D"], train: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "N D"]:
     """The poses, larger or smaller as seen from the stance, so that half of them are `DISTANCE` or more from every training pose."""
     body, stance = body_angles(rig), choreography.stance(rig)
-    tree = cKDTree(train[:, body])
+    tree = cKDTree(_spread(train, MOST_TRAINING)[:, body])
+    judged = _spread(theta, MOST_TEST)
 
-    def scaled(scale: float) -> Float[np.ndarray, "N D"]:
+    def scaled(theta: Float[np.ndarray, "N D"], scale: float) -> Float[np.ndarray, "N D"]:
         changed = np.where(body, stance + scale * (theta - stance), theta)
         return np.where(body, choreography.within_reach(rig, changed), changed)
 
     smallest, largest = 0.1, 3.0
     for _ in range(20):
         middle = 0.5 * (smallest + largest)
-        if np.median(tree.query(scaled(middle)[:, body])[0]) < DISTANCE:
+        if np.median(tree.query(scaled(judged, middle)[:, body])[0]) < DISTANCE:
             smallest = middle
         else:
             largest = middle
-    return scaled(largest)
+    return scaled(theta, largest)
+
+
+def _spread(poses: Float[np.ndarray, "N D"], most: int) -> Float[np.ndarray, "n D"]:
+    """Every k-th of some poses: at most `most`."""
+    return poses[:: max(1, -(-len(poses) // most))]
 
 
 def _wander(time: np.ndarray, rng: np.random.Generator, turn: float) -> Float[np.ndarray, "N 4 4"]:

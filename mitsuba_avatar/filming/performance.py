@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float32
+from scipy.sparse import csr_array
 
 from mitsuba_avatar.body.skeleton import Skeleton
 from mitsuba_avatar.body.skinning import pose_vertices, unpose_vertices
@@ -21,7 +22,7 @@ from mitsuba_avatar.filming.anatomy import FOOT, LEG
 from mitsuba_avatar.filming.cloth_simulation import BodyMotion, ClothSimulator, ClothState
 from mitsuba_avatar.filming.garment_layers import register_garment
 from mitsuba_avatar.filming.garment_record import GarmentRecord
-from mitsuba_avatar.filming.motion import Motion, perform
+from mitsuba_avatar.filming.motion import Motion, parts_of, perform
 from mitsuba_avatar.filming.person import Person, dress_person
 from mitsuba_avatar.filming.settings import ClothingSettings, StudioSettings
 
@@ -152,16 +153,20 @@ class Performance:
         return np.stack([self._posed(self._transforms(self.motion, frame), rest)[::7] for frame in frames])
 
     def _on_floor(self, motion: Motion) -> Motion:
-        """The motion, shifted so that the lowest point of every frame is as high above the floor as it should be, whatever ankles do."""
-        anatomy = self.person.anatomy
-        feet = np.flatnonzero(anatomy.weight(ON_THE_FLOOR) > 0.5)
-        rest, weights = torch.from_numpy(self.person.filmed.vertices[feet])[None], self._weights[feet]
+        """The motion, shifted so that the lowest point of every frame is as high above the floor as it should be, whatever ankles do.
+
+        Skinning is linear in the transforms, and few joints move a vertex: heights of all frames are a product with a sparse matrix.
+        """
+        feet = np.flatnonzero(self.person.anatomy.weight(ON_THE_FLOOR) > 0.5)
+        weights = self.person.rig.skinning_weights[feet].astype(np.float64)
+        rest = np.concatenate([self.person.filmed.vertices[feet], np.ones((len(feet), 1))], axis=1)
+        height_from_rows = csr_array((weights[:, :, None] * rest[:, None, :]).reshape(len(feet), -1))  # [vertices, J * 4]
         root = motion.root.copy()
-        with torch.no_grad():
-            for frame in range(len(root)):
-                transforms = self._transforms(motion, frame)
-                lowest = float(pose_vertices(rest, transforms, weights)[..., 2].min())
-                root[frame, 2, 3] += motion.clearance[frame] - lowest
+        for part in parts_of(len(root)):
+            with torch.no_grad():
+                transforms = self._skeleton(torch.from_numpy(motion.theta[part]), torch.from_numpy(motion.root[part]))
+            rows = transforms[:, :, 2].flatten(1).numpy().astype(np.float64)  # [n, J * 4], what makes z
+            root[part, 2, 3] += motion.clearance[part] - (height_from_rows @ rows.T).min(axis=0)
         return replace(motion, root=root)
 
     def _segment_of(self, frame: int) -> int:

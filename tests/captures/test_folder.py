@@ -128,6 +128,11 @@ def test_interrupted_writer_is_refused_by_the_reader_and_resumes(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"expected 4 images in .*; got 3, the first missing is .*left/000101.png"):
         resumed.finish()
     assert fill(resumed) == [("left", 1)]
+    for name, camera in resumed.cameras.items():
+        assert not resumed.has_all(), "masks are missing"
+        for index in range(len(resumed.frames)):
+            resumed.write_mask(name, index, np.full((camera.height, camera.width), 0.5))
+    assert resumed.has_all()
     assert resumed.finish().camera_names() == ["front", "left"]
     with pytest.raises(FileExistsError, match="got a finished capture"):
         begin(tmp_path / "two")
