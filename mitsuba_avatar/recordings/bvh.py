@@ -295,7 +295,9 @@ def _unit(path: Path, stature: float, unit: LengthUnit) -> str:
                 f"Set motion.bvh_unit to one of {', '.join(METRES_PER_UNIT)}."
             )
         return fitting[0]
-    if not 0.4 <= stature * METRES_PER_UNIT[unit] <= 3.5:  # children and giants are allowed to who says so
+    # Small children and giants are allowed to who says so, unless another unit makes a person of usual size.
+    smallest, largest = HEIGHTS if fitting else (0.4, 3.5)
+    if not smallest <= stature * METRES_PER_UNIT[unit] <= largest:
         raise ValueError(
             f"read_bvh(): expected a person in {path}; got one of {stature * METRES_PER_UNIT[unit]:.4g} m if its unit is {unit}. "
             f"Set motion.bvh_unit to {fitting[0] if fitting else 'auto'}."

@@ -87,6 +87,11 @@ def test_a_size_that_no_unit_explains_is_refused_and_an_explicit_unit_is_checked
     assert not read_bvh(path, unit="centimetres").unit_is_assumed
     with pytest.raises(ValueError, match=r"if its unit is metres. Set motion.bvh_unit to centimetres"):
         read_bvh(path, unit="metres")
+    path = write(tmp_path, bvh_text(*movement(2), Encoding(unit=0.0254)))
+    with pytest.raises(ValueError, match=r"got one of 0\.\d+ m if its unit is centimetres. Set motion.bvh_unit to inches"):
+        read_bvh(path, unit="centimetres")
+    toddler = write(tmp_path, bvh_text(*movement(2), Encoding(unit=2.0)))
+    assert read_bvh(toddler, unit="metres").unit == "metres", "no other unit makes a person of it"
 
 
 def test_a_missing_file_is_named(tmp_path: Path):
