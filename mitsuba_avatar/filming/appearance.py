@@ -6,6 +6,7 @@ between 0.02 and 0.8, chosen so that 8-bit images under the dome neither clip no
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from mitsuba_avatar.captures.images import write_image
 from mitsuba_avatar.filming.anatomy import Anatomy, smooth_step
 from mitsuba_avatar.filming.canvas import Canvas, Map, Paint, Surface
 from mitsuba_avatar.filming.clothing import DressedBody, hairline
-from mitsuba_avatar.filming.leafy_prints import paint_leafy_shirt, paint_leafy_skirt, paint_light_hair, paint_light_trousers
-from mitsuba_avatar.filming.prints import paint_hair, paint_shirt, paint_skirt, paint_trousers
+from mitsuba_avatar.filming.fabric import strands
+from mitsuba_avatar.filming.leafy_prints import FAIR_HAIR, paint_leafy_shirt, paint_light_trousers
+from mitsuba_avatar.filming.prints import DARK_HAIR, paint_shirt, paint_trousers
 from mitsuba_avatar.filming.skin import paint_skin
 
 SPECULAR = 0.35  # of skin
@@ -25,16 +27,14 @@ ATTIRES: dict[str, dict[str, Callable[[Canvas], Paint]]] = {
     "striped": {
         "trousers": paint_trousers,
         "shorts": paint_trousers,
-        "skirt": paint_skirt,
         "shirt": paint_shirt,
-        "hair": paint_hair,
+        "hair": partial(strands, colour=DARK_HAIR),
     },
     "leafy": {
         "trousers": paint_light_trousers,
         "shorts": paint_light_trousers,
-        "skirt": paint_leafy_skirt,
         "shirt": paint_leafy_shirt,
-        "hair": paint_light_hair,
+        "hair": partial(strands, colour=FAIR_HAIR),
     },
 }
 
@@ -92,7 +92,7 @@ def paint_garment(anatomy: Anatomy, name: str, surface: Surface, size: int, seed
 
     Args:
         anatomy: of the bare rig.
-        name: "shirt", "trousers", "shorts" or "skirt".
+        name: "shirt", "trousers" or "shorts".
         surface: the garment's mesh at rest (`Surface.of_garment`).
         size: S, texels along a side.
         seed: decides the pattern of fibres.

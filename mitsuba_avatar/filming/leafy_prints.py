@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from mitsuba_avatar.filming.anatomy import ARM, LEG, SIDES, smooth_step
+from mitsuba_avatar.filming.anatomy import SIDES
 from mitsuba_avatar.filming.canvas import Canvas, Map, Paint, bands, within
-from mitsuba_avatar.filming.prints import EDGE, around_pelvis, strands
+from mitsuba_avatar.filming.fabric import EDGE, dyed, on_leg, on_sleeve, weave
 
-HAIR = (0.34, 0.185, 0.075)
+FAIR_HAIR = (0.34, 0.185, 0.075)
 GROUND = (0.055, 0.125, 0.085)
 LEAF = (0.50, 0.52, 0.20)
 FLOWER = (0.62, 0.33, 0.40)
@@ -21,14 +21,14 @@ def paint_leafy_shirt(canvas: Canvas) -> Paint:
     """Dark green, leaves scattered more densely on the right half, a row of flowers down the left, an ochre right sleeve."""
     anatomy, points = canvas.anatomy, canvas.points
     base, top = anatomy.joint("spine05"), anatomy.joint("neck01")
-    right_sleeve = smooth_step(canvas.field(anatomy.weight(ARM, "R")), 0.42, 0.58)
-    weave = 1 + 0.06 * canvas.noise(0.006) + 0.04 * canvas.noise(0.06)
-    paint = Paint(np.array(GROUND) * weave[..., None], np.full_like(weave, 0.74))
+    right_sleeve = on_sleeve(canvas, "R")
+    fibres = weave(canvas, (0.06, 0.006), (0.04, 0.06))
+    paint = dyed(fibres, GROUND, 0.74)
     paint = paint.over(LEAF, _leaves(canvas, base, top))
     for height in (0.15, 0.34, 0.53, 0.72):
         centre = base + height * (top - base)
         paint = paint.over(FLOWER, _flower(points, centre[0] + 0.085, centre[2]) * (points[..., 1] < 0.0) * (1 - right_sleeve))
-    ochre = Paint(np.array(SLEEVE) * weave[..., None], paint.roughness)
+    ochre = dyed(fibres, SLEEVE, 0.74)
     start, direction, length = anatomy.axis("upperarm01.R", "lowerarm01.R")
     ochre = ochre.over(GROUND, bands((points - start) @ direction / length, period=0.5, fill=0.25))
     return paint.under(ochre, right_sleeve)
@@ -37,10 +37,9 @@ def paint_leafy_shirt(canvas: Canvas) -> Paint:
 def paint_light_trousers(canvas: Canvas) -> Paint:
     """Sand-coloured, with seams down the outer sides, a pocket on the left thigh and a darker right cuff."""
     anatomy, points = canvas.anatomy, canvas.points
-    weave = 1 + 0.06 * canvas.noise(0.006) + 0.05 * canvas.noise(0.09)
-    paint = Paint(np.array(SAND) * weave[..., None], np.full_like(weave, 0.88))
+    paint = dyed(weave(canvas, (0.06, 0.006), (0.05, 0.09)), SAND, 0.88)
     for side in SIDES:
-        leg = canvas.field(anatomy.weight(LEG, side)) > 0.5
+        leg = on_leg(canvas, side)
         hip, knee, ankle = (anatomy.joint(f"{name}.{side}") for name in ("upperleg01", "lowerleg01", "foot"))
         outwards = (points[..., 0] - hip[0]) * (1 if side == "L" else -1)
         paint = paint.over(SEAM, within(np.abs(points[..., 1] - hip[1]), 0.006, EDGE) * (outwards > 0.0) * leg)
@@ -51,21 +50,6 @@ def paint_light_trousers(canvas: Canvas) -> Paint:
         else:
             paint = paint.over(SEAM, within(np.abs(points[..., 2] - ankle[2] - 0.05), 0.035, EDGE) * leg)
     return paint
-
-
-def paint_leafy_skirt(canvas: Canvas) -> Paint:
-    """Sand-coloured with slanted bands and a green border that rises on the right."""
-    angle, height = around_pelvis(canvas)
-    weave = 1 + 0.06 * canvas.noise(0.006)
-    paint = Paint(np.array(SAND) * weave[..., None], np.full_like(weave, 0.85))
-    # A whole number of bands around the body, or they would break at the back.
-    paint = paint.over(SEAM, bands(angle / (2 * np.pi) * 5 + height * 4, period=1.0, fill=0.3))
-    return paint.over(GROUND, smooth_step(height + 0.05 * np.sin(angle), -0.27, -0.28))
-
-
-def paint_light_hair(canvas: Canvas) -> Paint:
-    """Fair strands."""
-    return strands(canvas, HAIR)
 
 
 def _leaves(canvas: Canvas, base: np.ndarray, top: np.ndarray) -> Map:
