@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdout.write(plan.text())
             return 0
         shard = Shard.parse(command.shard)
-        if plan.seconds / shard.count > LONG:
+        if plan.seconds_of_shard(shard.count) > LONG:
             raise ValueError(f"expected less work than {LONG / 3600:.0f} hours; got\n{plan.text()}Give --shard, with more parts.")
         backend.select_variant(command.variant)
         return show_gates(settings, command.out) if command.gates else film(settings, command.out, shard)

@@ -36,6 +36,10 @@ def test_the_plan_of_the_papers_size_counts_seven_million_images():
     plan = plan_filming(resolve("studio/paper", kind=StudioSettings))
     assert (plan.frames, plan.cameras, plan.width, plan.height, plan.images) == (50_000, 140, 2668, 4096, 7_000_000)
     assert "7,000,000 images" in plan.text() and "days" in plan.text()
+    assert plan.preparation > 60, "every shard paints 2048 x 2048 texels and plans 50,000 frames"
+    assert f"{plan.preparation:.0f} seconds of it" in plan.text()
+    assert plan.seconds_of_shard(plan.suggested_shards()) == pytest.approx(3600, rel=0.01)
+    assert plan.seconds_of_shard(1) == plan.seconds
 
 
 def planned(**changes: dict[str, object]) -> FilmingPlan:
@@ -49,7 +53,8 @@ def planned(**changes: dict[str, object]) -> FilmingPlan:
 def test_cost_is_proportional_to_frames():
     once, thrice = planned(), planned(motion={"train_frames": 24, "test_frames": 12})
     assert (once.frames, thrice.frames) == (12, 36)
-    assert thrice.seconds == pytest.approx(3 * once.seconds) and thrice.bytes == pytest.approx(3 * once.bytes)
+    assert thrice.seconds - thrice.preparation == pytest.approx(3 * (once.seconds - once.preparation))
+    assert thrice.bytes == pytest.approx(3 * once.bytes)
 
 
 @pytest.mark.parametrize(
