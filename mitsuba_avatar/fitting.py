@@ -40,7 +40,7 @@ from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.distributed import Process, join_processes, leave_processes
 from mitsuba_avatar.training.loop import MetricsLog, Trainer
 from mitsuba_avatar.training.readiness import check_trainable, open_as_set
-from mitsuba_avatar.training.run_folder import RunFolder
+from mitsuba_avatar.training.run_folder import CAMERA_RESPONSE_FILE, RunFolder
 from mitsuba_avatar.training.statistics import evenly_spaced, training_statistics
 
 LOG_EVERY = 10  # iterations between lines of metrics.jsonl
@@ -155,6 +155,8 @@ class Fit:
                     save_image(self.run.previews / f"{iteration:06d}.png", presentation.preview(shots))
                 if iteration % training.checkpoint_every == 0 or is_last:
                     trainer.save(self.run.checkpoints, psnr)
+                    if trainer.response is not None:
+                        trainer.response.write_facts(self.run.path / CAMERA_RESPONSE_FILE)
                 return not is_stopping
 
             return trainer.run(after_step)

@@ -164,6 +164,27 @@ class DisentanglementSettings:
 
 
 @dataclass(frozen=True)
+class CameraResponseSettings:
+    """What training learns of each camera beside the avatar; left out of every picture that is rendered (training/camera_response.py)."""
+
+    blur: bool = False  # a blur of each camera
+    bias: bool = False  # a coarse map of radiance that each camera adds to the person
+    identity_camera: str = ""  # training camera that keeps neither; empty for the first
+    bias_cells: int = 8  # along the longer side of an image
+    bias_decay: float = 0.1  # of the bias, per unit of learning rate and step
+    learning_rate: float = 5e-3  # of both; square pixels, linear radiance; falls with the avatar's
+
+    def __post_init__(self) -> None:
+        expect(self, "positive", "bias_cells", "learning_rate")
+        expect(self, "zero or more", "bias_decay")
+
+    @property
+    def is_learnt(self) -> bool:
+        """Whether there is anything to learn."""
+        return self.blur or self.bias
+
+
+@dataclass(frozen=True)
 class TrainingSettings:
     """The optimisation loop."""
 
@@ -211,4 +232,5 @@ class Settings:
     loss: LossSettings = field(default_factory=LossSettings)
     disentanglement: DisentanglementSettings = field(default_factory=DisentanglementSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
+    camera_response: CameraResponseSettings = field(default_factory=CameraResponseSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)

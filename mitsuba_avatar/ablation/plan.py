@@ -128,7 +128,7 @@ def _check_same(planned: PlannedRun) -> None:
     was, wanted = load_settings(saved), planned.settings
     changed = [
         f"{section}.{name} {before} -> {after}"
-        for section in ("capture", "model", "loss", "disentanglement", "training", "evaluation")
+        for section in ("capture", "model", "loss", "disentanglement", "camera_response", "training", "evaluation")
         for name, before in dataclasses.asdict(getattr(was, section)).items()
         if before != (after := dataclasses.asdict(getattr(wanted, section))[name])
     ]

@@ -28,6 +28,7 @@ from mitsuba_avatar.model.keypoints import DrivenKeypoints, lists_face_landmarks
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.settings import Settings
 from mitsuba_avatar.training.batches import FrameBatch, FrameReader, batches, training_sampler
+from mitsuba_avatar.training.camera_response import CameraResponse
 from mitsuba_avatar.training.checkpoints import Checkpoints
 from mitsuba_avatar.training.distributed import Process
 from mitsuba_avatar.training.divergence import DivergedError, DivergenceGuard, SkippedStep
@@ -85,6 +86,9 @@ class Trainer:
         self.optimizer = torch.optim.Adam(avatar.parameters(), lr=training.learning_rate, fused=True)
         self.sampler = training_sampler(reader.capture, training, process)
         self.information, self.keypoints = self._disentanglement(rig)
+        self.response = CameraResponse.of(reader.capture, settings)
+        if self.response is not None:
+            self.response.to(self.device)
         self.guard = DivergenceGuard(training)
         self.iteration = 0
         self.timer = StepTimer()
@@ -142,11 +146,15 @@ class Trainer:
             raise problem or DivergedError(f"step(): another rank's batch of iteration {self.iteration} was refused; its message says why.")
         with self.timer.part("backward"):
             self.optimizer.zero_grad(set_to_none=True)
+            if self.response is not None:
+                self.response.zero_grad()
             loss.backward()
         norm = nn.utils.clip_grad_norm_(self.avatar.parameters(), self.settings.training.gradient_clip)
         self._require_finite("gradient", {"norm": norm}, batch)
         with self.timer.part("optimizer"):
             self.optimizer.step()
+            if self.response is not None:
+                self.response.step(self.learning_rate(self.iteration) / self.settings.training.learning_rate, self.process)
         if self.information is not None and latents is not None:
             with self.timer.part("information"):
                 self.information.observe(latents, self.avatar.standardized_driving(batch.theta, batch.face))
@@ -182,6 +190,8 @@ class Trainer:
         state = {"optimizer": self.optimizer.state_dict(), "guard": self.guard.state_dict()}
         if self.information is not None:
             state["information"] = self.information.state_dict()
+        if self.response is not None:
+            state["camera_response"] = self.response.saved()
         checkpoints.save(self.avatar.state_dict(), state, self.iteration, psnr)
 
     def resume(self, checkpoints: Checkpoints) -> None:
@@ -199,6 +209,8 @@ class Trainer:
             self.guard.load_state_dict(state["guard"])
         if self.information is not None and "information" in state:
             self.information.load_state_dict(state["information"])
+        if self.response is not None and "camera_response" in state:
+            self.response.restore(state["camera_response"])
 
     def _disentanglement(self, rig: Rig) -> tuple[MutualInformation | None, DrivenKeypoints | None]:
         """What the two disentangling terms need, each where its weight asks for it."""
@@ -248,6 +260,8 @@ class Trainer:
             seed = (settings.training.seed * self.process.num_ranks + self.process.rank) * SEED_STRIDE + self.iteration
             textures = output.textures.flatten(0, 1)
             image, mask = self.renderer.render(output.vertices, textures, batch.cameras, seed=seed, background=batch.backgrounds)
+            if self.response is not None:
+                image = self.response(image, mask, batch)
         return LossInputs(
             image=batch.within_views(encode(image, "srgb")),
             mask=batch.within_views(mask),

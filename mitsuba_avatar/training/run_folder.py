@@ -6,6 +6,7 @@ rig.npz              the capture's rig
 run.json             capture path, face signal's size, versions
 metrics.jsonl        one line per logged iteration
 checkpoints/         see training/checkpoints.py
+camera_response.json what was learnt of each camera, if anything was
 previews/            panels drawn during training
 pictures/            held-out cameras, comparison with the baselines, curves
 orbit.mp4            the avatar driven by the test split, on an orbit
@@ -29,6 +30,7 @@ from mitsuba_avatar.settings import Settings
 from mitsuba_avatar.training.checkpoints import Checkpoints
 from mitsuba_avatar.training.readiness import open_as_set
 
+CAMERA_RESPONSE_FILE = "camera_response.json"
 VERSIONED = ("mitsuba", "drjit", "torch", "numpy")
 
 
