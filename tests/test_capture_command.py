@@ -195,6 +195,10 @@ def test_a_goliath_capture_is_described_checked_and_converted_in_place(whole, tm
     capture = Capture.open(tmp_path / "own", image_scale=0.5)
     assert len(capture.frames) == 2 and capture.theta is not None and capture.image("left", 1).shape == (24, 32, 3)
     assert not list((tmp_path / "own").rglob("*.avif")) and sorted(exported.rglob("*")) == zips
+    (exported / "shared").rename(tmp_path / "elsewhere")
+    assert main(["check", f"goliath:{exported}"]) == 1 and "expected a rig at" in capsys.readouterr().err
+    (tmp_path / "elsewhere").rename(tmp_path / "shared")  # beside the capture, and found when it comes later
+    assert main(["check", f"goliath:{exported}", "--frames", "1", "--out", str(tmp_path / "sheets")]) == 0
     assert main(["info", f"golliath:{exported}"]) == 1
     assert "FORMAT one of goliath, actorshq" in capsys.readouterr().err
 

@@ -18,7 +18,7 @@ from mitsuba_avatar.captures.arrays import open_frame_array
 from mitsuba_avatar.captures.description import ImagesFrom
 from mitsuba_avatar.captures.folder import DESCRIPTION_FILE, Capture
 from mitsuba_avatar.captures.formats.conversion import ConversionOptions, Track, convert
-from mitsuba_avatar.captures.formats.goliath import GoliathSource
+from mitsuba_avatar.captures.formats.goliath import GoliathSource, find_assets
 from mitsuba_avatar.captures.formats.opening import FormatName, SourceName, open_source
 from mitsuba_avatar.captures.formats.source import Source, SourceOptions
 from mitsuba_avatar.captures.formats.source_state import source_state
@@ -54,31 +54,34 @@ def capture_folder(name: str | Path, track: Track = lambda items, _: items) -> P
     source_name = SourceName.parse(str(name))
     if source_name is None:
         return Path(name)
-    place = cache_folder() / "in_place" / f"{source_name.path.resolve().name}-{_digest(source_name)}"
-    path = place / source_state(source_name.path)
-    if (path / DESCRIPTION_FILE).is_file():
-        return path
+    place, leaf = cache_folder() / "in_place" / _digest(source_name), source_name.path.resolve().name
+    # A body model may be laid beside a capture later.
+    has_body = source_name.format == "goliath" and find_assets(source_name.path) is not None
+    current = place / (source_state(source_name.path) + ("-body" if has_body else ""))
+    if (current / leaf / DESCRIPTION_FILE).is_file():
+        return current / leaf
     source = open_source(source_name.format, source_name.path)
     images_from = images_in_place(source_name.format, source_name.path, source, SourceOptions())
     building = place / f".{uuid.uuid4().hex[:8]}"
     try:
-        convert_with_body(source, building, ConversionOptions(own_sizes=True, images_from=images_from), track)
+        convert_with_body(source, building / leaf, ConversionOptions(own_sizes=True, images_from=images_from), track)
         for older in place.iterdir():  # of earlier states of the data set
-            if older.name != path.name and not older.name.startswith("."):
+            if older.name != current.name and not older.name.startswith("."):
                 shutil.rmtree(older)
         try:
-            os.rename(building, path)
+            os.rename(building, current)
         except OSError:
-            if not (path / DESCRIPTION_FILE).is_file():  # otherwise another process was as fast
+            if not (current / leaf / DESCRIPTION_FILE).is_file():  # otherwise another process was as fast
                 raise
     finally:
         shutil.rmtree(building, ignore_errors=True)
-    return path
+    return current / leaf
 
 
 def _digest(source_name: SourceName) -> str:
-    """What tells data sets apart whose folders have the same name."""
-    return hashlib.sha256(f"{LAYOUT_VERSION} {source_name.format} {source_name.path.resolve()}".encode()).hexdigest()[:12]
+    """What tells data sets apart, whatever their folders are called."""
+    text = f"{LAYOUT_VERSION} {source_name.format} {source_name.path.resolve()}"
+    return f"{source_name.format}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
 
 class _MomentumBody:

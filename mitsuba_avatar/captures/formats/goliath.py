@@ -72,6 +72,12 @@ class MomentumTracking:
     world_from_model: Float64[np.ndarray, "4 4"]
 
 
+def find_assets(path: Path) -> Path | None:
+    """File of the body model in shared/ in a capture, or beside it; None if there is none."""
+    folders = (path / "shared", path, path.parent / "shared", path.parent)
+    return next((folder / name for folder in folders for name in ASSETS_FILES if (folder / name).is_file()), None)
+
+
 class GoliathSource(Source):
     """A body capture in Goliath's layout; zips may also be unpacked folders of the same names.
 
@@ -186,11 +192,8 @@ class GoliathSource(Source):
 
     @property
     def assets_path(self) -> Path | None:
-        """File of the body model: the user's choice, or shared/ in the capture or beside it."""
-        if self.options.assets is not None:
-            return self.options.assets
-        folders = (self.path / "shared", self.path, self.path.parent / "shared", self.path.parent)
-        return next((folder / name for folder in folders for name in ASSETS_FILES if (folder / name).is_file()), None)
+        """File of the body model: the user's choice, or `find_assets`."""
+        return self.options.assets if self.options.assets is not None else find_assets(self.path)
 
     def pose(self, frame_index: int, count: int | None = None) -> Float64[np.ndarray, "P"] | None:
         """Pose parameters of a frame (104 in the releases: 6 of the root, 98 local); None if the capture has none.

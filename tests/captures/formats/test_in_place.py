@@ -129,7 +129,8 @@ def test_a_name_with_a_format_is_a_capture_in_the_cache_made_once_and_again_afte
         sorted((data / "images" / camera).iterdir())[-1].unlink()
     again = capture_folder(f"easymocap:{data}")
     assert again != folder and len(Capture.open(again).frames) == len(capture.frames) - 1
-    assert [entry.name for entry in again.parent.iterdir()] == [again.name], "nothing of the old state, nothing half made"
+    assert again.name == "data", "reports and contact sheets are named after the data set"
+    assert [entry.name for entry in again.parents[1].iterdir()] == [again.parent.name], "nothing of the old state, nothing half made"
 
 
 def test_a_data_set_that_cannot_be_read_leaves_nothing_in_the_cache(captured, tmp_path, monkeypatch):
