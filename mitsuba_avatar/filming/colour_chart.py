@@ -48,7 +48,7 @@ def film_charts(folder: Path | str, cameras: Mapping[str, Camera], settings: Stu
     folder = Path(folder)
     light = dataclasses.replace(settings.light, samples_per_pixel=settings.cameras.chart_samples_per_pixel)
     layer = Layer("chart", grid_topology(2, 2), _appearance(), is_two_sided=True)
-    stage = Stage([layer], list(cameras.values()), dataclasses.replace(settings, light=light))
+    stage = Stage([layer], list(cameras.values()), dataclasses.replace(settings, light=light), together=1)  # a chart before each camera
     sensor = Sensor.of(settings)
     corners, reference = {}, {}
     for index, (name, camera) in enumerate(cameras.items()):

@@ -1,9 +1,10 @@
-"""One image of a Mitsuba scene: camera rays for the pixels that may show something, the scene's integrator, the mean of every pixel.
+"""Images of a Mitsuba scene: camera rays for the pixels that may show something, the scene's integrator, the mean of every pixel.
 
 Rays are made here and not by Mitsuba's film, for three reasons: pixels that cannot see the person cost nothing (six in seven of a
 full-body portrait), sums have a fixed order, so that the same seed gives the same bits, and memory is bounded at any image size.
+Small images are traced several in a launch: preparing one in Python costs a quarter of an image of 192 x 256 pixels, whatever it holds.
 
-Symbols: P pixels, S samples a pixel, L = P * S lanes of a launch. Pixels and metres.
+Symbols: C cameras, P pixels, S samples a pixel, L = P * S lanes of a launch. Pixels and metres.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from mitsuba_avatar.captures.cameras import Camera
-from mitsuba_avatar.rendering.camera_rays import LARGEST_LAUNCH, NEAR, camera_row, jittered_rays
+from mitsuba_avatar.rendering.camera_rays import LARGEST_LAUNCH, NEAR, camera_rows, jittered_rays, rows_of_lanes
 
 
 class Exposure:
@@ -28,25 +29,27 @@ class Exposure:
         sampler.set_samples_per_wavefront(self.samples)
         self._sampler = sampler
 
-    def begin(self, camera: Camera, pixels: Bool[np.ndarray, "H W"], seed: Sequence[int]) -> "PendingImage":
-        """Start path-tracing one image; on CPUs the work goes on while Python prepares the next one.
+    def begin(self, cameras: Sequence[Camera], pixels: Bool[np.ndarray, "C H W"], seed: Sequence[int]) -> "PendingImages":
+        """Start path-tracing some images; on CPUs the work goes on while Python prepares the next ones.
 
         Args:
-            camera: without distortion.
-            pixels: [H, W] which pixels to trace; the others stay zero.
-            seed: numbers that together name this image; the same ones give the same bits.
+            cameras: of one size, without distortion.
+            pixels: [C, H, W] which pixels to trace; the others stay zero.
+            seed: numbers that together name these images; the same ones, of the same cameras, give the same bits.
         """
-        chosen = np.flatnonzero(pixels)
+        chosen = np.flatnonzero(pixels)  # of all images, one after the other
         at_once = max(1, LARGEST_LAUNCH // self.samples)
-        row = camera_row(camera)
+        rows = camera_rows(cameras)
         chunks = [chosen[start : start + at_once] for start in range(0, len(chosen), at_once)]
         seeds = np.random.SeedSequence(seed).generate_state(len(chunks)) if chunks else ()
-        parts = [(chunk, self._trace(row, camera.width, chunk, int(chunk_seed))) for chunk, chunk_seed in zip(chunks, seeds, strict=True)]
-        return PendingImage(camera.height, camera.width, parts)
+        parts = [(chunk, self._trace(rows, pixels.shape, chunk, int(chunk_seed))) for chunk, chunk_seed in zip(chunks, seeds, strict=True)]
+        return PendingImages(pixels.shape, parts)
 
-    def _trace(self, row: list, width: int, pixels: Int[np.ndarray, "P"], seed: int) -> list:
-        """One launch: red, green, blue and coverage of pixels."""
-        ray = jittered_rays(row, width, pixels, self.samples, self._sampler, seed)
+    def _trace(self, rows: list, shape: tuple[int, int, int], pixels: Int[np.ndarray, "P"], seed: int) -> list:
+        """One launch: red, green, blue and coverage of pixels of the images [C, H, W]."""
+        camera, pixel = np.divmod(pixels, shape[1] * shape[2])
+        row = rows_of_lanes(rows, camera, self.samples)
+        ray = jittered_rays(row, shape[2], pixel, self.samples, self._sampler, seed)
         radiance, valid, _ = self.integrator.sample(self.scene, self._sampler, ray)
         lit = dr.select(valid, radiance, 0)
         channels = [lit.x, lit.y, lit.z, dr.select(valid, mi.Float(1), 0)]
@@ -56,19 +59,19 @@ class Exposure:
         return means
 
 
-class PendingImage:
-    """An image that may still be in the making."""
+class PendingImages:
+    """Images that may still be in the making."""
 
-    def __init__(self, height: int, width: int, parts: list):
-        self._shape, self._parts = (height, width, 4), parts
+    def __init__(self, shape: tuple[int, int, int], parts: list):
+        self._shape, self._parts = shape, parts
 
-    def finish(self) -> Float32[np.ndarray, "H W 4"]:
-        """Wait for it: [H, W, 4] linear radiance, premultiplied, and coverage."""
-        height, width, channels = self._shape
-        image = np.zeros((height * width, channels), dtype=np.float32)
+    def finish(self) -> Float32[np.ndarray, "C H W 4"]:
+        """Wait for them: [C, H, W, 4] linear radiance, premultiplied, and coverage."""
+        images = np.zeros((*self._shape, 4), dtype=np.float32)
+        flat = images.reshape(-1, 4)
         for pixels, means in self._parts:
-            image[pixels] = np.stack([np.array(mean) for mean in means], axis=-1)
-        return image.reshape(self._shape)
+            flat[pixels] = np.stack([np.array(mean) for mean in means], axis=-1)
+        return images
 
 
 def visible_pixels(camera: Camera, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "H W"]:

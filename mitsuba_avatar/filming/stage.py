@@ -6,6 +6,7 @@ shading crosses seams. (Differentiable rendering must not do this; filming takes
 A scene is never rebuilt: rebuilding leaks memory (mitsuba3 issue 1890).
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,9 @@ from mitsuba_avatar.body.rig import Topology
 from mitsuba_avatar.body.split_mesh import split_at_seams
 from mitsuba_avatar.captures.cameras import Camera
 from mitsuba_avatar.filming.appearance import Appearance
-from mitsuba_avatar.filming.exposure import Exposure, visible_pixels
+from mitsuba_avatar.filming.exposure import Exposure, PendingImages, visible_pixels
 from mitsuba_avatar.filming.settings import StudioSettings
+from mitsuba_avatar.rendering.camera_rays import LARGEST_LAUNCH
 from mitsuba_avatar.resources import find_resource
 
 SPECULAR_SAMPLES = 0.12  # share of samples for the specular lobe; the default of a half doubles the noise of the diffuse one
@@ -58,8 +60,14 @@ class Layer:
 class Stage:
     """A Mitsuba scene with a person in it, seen by the cameras of a capture. Call `rendering.backend.select_variant` before."""
 
-    def __init__(self, layers: Sequence[Layer], cameras: Sequence[Camera], settings: StudioSettings):
+    def __init__(self, layers: Sequence[Layer], cameras: Sequence[Camera], settings: StudioSettings, together: int = 0):
         """Load the settings' scene file and put the layers into it.
+
+        Args:
+            layers: what is seen.
+            cameras: of one size.
+            settings: scene, light and samples.
+            together: cameras of which one launch traces all; 0 for as many as memory allows, but half of them at most.
 
         Raises:
             FileNotFoundError: if there is no such scene.
@@ -77,6 +85,7 @@ class Stage:
         meshes = {mesh.layer.name: mesh.shape for mesh in self._meshes}
         self._exposure = Exposure(mi.load_dict({"type": "scene", **parts, **meshes}), settings.light.samples_per_pixel)
         self._parameters = mi.traverse(self._exposure.scene)
+        self._together = together or _as_many_as_fit(self.cameras, self._exposure.samples)
 
     def shoot(
         self, vertices: Sequence[Float32[np.ndarray, "_ 3"]], seed: int, cameras: Sequence[int] | None = None
@@ -104,18 +113,31 @@ class Stage:
     ) -> Iterator[tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]]:
         """Radiance and coverage camera by camera, as `shoot` returns them together: at the paper's size, all of a frame fill a memory.
 
-        One image is traced while the caller sees to the one before; the stage is busy until the last was taken.
+        Cameras are traced in groups of neighbours, whole groups always, or an image's bits would depend on which others are asked for.
+        One group is traced while the caller sees to the one before; the stage is busy until the last image was taken.
         """
         self._move(vertices)
-        pending = None
-        for index in cameras:
-            following = self._exposure.begin(self.cameras[index], self._pixels(index, vertices), (seed, index))
-            # One image is traced while Python prepares the next; more at once would only need memory.
-            if pending is not None:
-                yield _parted(pending.finish())
-            pending = following
-        if pending is not None:
-            yield _parted(pending.finish())
+        groups = [index // self._together for index in cameras]
+        order, left = list(dict.fromkeys(groups)), Counter(groups)
+        begun: dict[int, PendingImages] = {}
+        made: dict[int, Float32[np.ndarray, "c H W 4"]] = {}
+        for index, group in zip(cameras, groups, strict=True):
+            if group not in made:
+                # One group is traced while Python prepares the next; more at once would only need memory.
+                for other in order[order.index(group) :][:2]:
+                    if other not in begun:
+                        begun[other] = self._begin(other, vertices, seed)
+                made[group] = begun[group].finish()
+            yield _parted(made[group][index - group * self._together])
+            left[group] -= 1
+            if not left[group]:
+                del made[group], begun[group]
+
+    def _begin(self, group: int, vertices: Sequence[np.ndarray], seed: int) -> PendingImages:
+        """Start tracing the images of a group of cameras."""
+        places = range(group * self._together, min((group + 1) * self._together, len(self.cameras)))
+        pixels = np.stack([self._pixels(place, vertices) for place in places])
+        return self._exposure.begin([self.cameras[place] for place in places], pixels, (seed, group))
 
     def _move(self, vertices: Sequence[np.ndarray]) -> None:
         """Carry every mesh to its place in a frame."""
@@ -169,6 +191,13 @@ class _StagedMesh:
         parameters["vertex_texcoords"] = split.image_uv.ravel()
         parameters.update()
         self.shape = mesh
+
+
+def _as_many_as_fit(cameras: Sequence[Camera], samples: int) -> int:
+    """Cameras of a group: all their pixels fit into a launch; two groups at least, so that one is traced while Python prepares another."""
+    count = max(1, LARGEST_LAUNCH // (cameras[0].width * cameras[0].height * samples))
+    groups = max(2, -(-len(cameras) // count))
+    return -(-len(cameras) // groups)
 
 
 def _parted(image: Float32[np.ndarray, "H W 4"]) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
