@@ -44,7 +44,7 @@ from mitsuba_avatar.filming.tracking_noise import tracking_noise
 from mitsuba_avatar.filming.truth import TRUTH_FOLDER, OcclusionTruth, write_truth
 from mitsuba_avatar.resources import find_resource
 
-FILMING_VERSION = 5  # raised when what filming makes of the same settings changes, so that older cached captures are not taken
+FILMING_VERSION = 6  # raised when what filming makes of the same settings changes, so that older cached captures are not taken
 CONTACT_SHEET = "contact_sheet.png"
 OUTLINE_FRAMES = 200  # that decide where cameras look
 Progress = Callable[[str, int, int], None]  # what is done, steps done, steps in all

@@ -15,10 +15,10 @@ LIDS = (0.345, 0.124, 0.094)
 MOUTH = (0.20, 0.055, 0.050)
 NAILS = (0.56, 0.36, 0.29)
 BROWS = (0.055, 0.033, 0.022)
-SCLERA = (0.55, 0.52, 0.49)
-IRIS = (0.105, 0.062, 0.034)
-PUPIL = (0.02, 0.02, 0.02)
-IRIS_EDGE, PUPIL_EDGE = 0.45, 0.18  # radians from the direction of sight; a little larger than life, so that gaze shows in small images
+SCLERA = (0.48, 0.44, 0.41)
+IRIS = (0.042, 0.024, 0.013)
+PUPIL = (0.008, 0.008, 0.008)
+IRIS_EDGE, PUPIL_EDGE = 0.56, 0.22  # radians from the direction of sight; a little larger than life, so that gaze shows in small images
 
 
 def paint_skin(canvas: Canvas) -> Paint:
@@ -34,8 +34,8 @@ def paint_skin(canvas: Canvas) -> Paint:
     paint = paint.over((0.0, 0.0, 0.0), 0.18 * beard * head)
     rim_of_lids = np.hypot(np.abs(across) - 0.0315, up + 0.001) - 0.0165
     paint = paint.over(LIDS, 0.25 * head * np.exp(-((rim_of_lids / 0.005) ** 2)) * (back < 0.03))
-    paint = paint.over(BROWS, 0.55 * head * _lash_line(canvas))
-    paint = paint.over(BROWS, 0.85 * head * _brows(canvas, across, back, up))
+    paint = paint.over(BROWS, 0.9 * head * _lash_line(canvas))
+    paint = paint.over(BROWS, 0.95 * head * _brows(canvas, across, back, up))
     paint = paint.over(LIPS, 0.65 * canvas.mask("lips"), roughness=0.38)
     paint = paint.over(NAILS, 0.8 * np.maximum(canvas.mask("fingernails"), canvas.mask("toenails")), roughness=0.3)
     paint = paint.over(MOUTH, np.maximum(canvas.mask("inside-mouth"), canvas.field((anatomy.piece == 1).astype(np.float64))))
@@ -61,7 +61,7 @@ def _brows(canvas: Canvas, across: Map, back: Map, up: Map) -> Map:
     side = np.abs(across)
     rise = 0.006 * np.sin(np.clip((side - 0.012) / 0.045, 0, 1) * np.pi * 0.75)
     arc = 0.0235 + 0.0011 * np.sign(across) + rise - 0.06 * np.clip(side - 0.043, 0, None)
-    width = 0.0040 * smooth_step(side, 0.064, 0.030) + 0.0008
+    width = 0.0054 * smooth_step(side, 0.064, 0.030) + 0.0010
     along = smooth_step(side, 0.010, 0.019) * smooth_step(side, 0.062, 0.050)
     # Hairs lean outwards: they run across and up.
     lean = np.stack([side - 0.9 * up, np.zeros_like(side), 0.15 * (up + 0.9 * side)], axis=-1)
@@ -88,7 +88,7 @@ def paint_eyes(canvas: Canvas) -> Paint:
     spokes = np.stack([offset[..., 0], 0.1 * angle, offset[..., 2]], axis=-1) / np.hypot(offset[..., 0], offset[..., 2])[..., None].clip(
         1e-5
     )
-    eye = Paint(np.array(SCLERA) * (1 - 0.12 * smooth_step(angle, 0.6, 1.3))[..., None], np.full_like(angle, 0.07))
+    eye = Paint(np.array(SCLERA) * (1 - 0.12 * smooth_step(angle, 0.6, 1.3))[..., None], np.full_like(angle, 0.16))
     eye = eye.over(LIDS, 0.35 * smooth_step(angle, 0.75, 1.35))  # vessels towards the lids
     streaks = np.clip(1 + 0.35 * canvas.noise(0.35, places=spokes), 0.4, 1.8)
     iris = np.array(IRIS) * (streaks * (1.35 - 0.7 * smooth_step(angle, 0.30, IRIS_EDGE)))[..., None]
