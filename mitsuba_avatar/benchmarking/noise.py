@@ -45,7 +45,7 @@ class NoiseRow:
     """One line of the sweep.
 
     Attributes:
-        radiance, mask: standard deviation of one evaluation, root mean square over the motions, as a share of the largest derivative;
+        radiance, mask: standard deviation of one evaluation, over motions and orientations, as a share of the largest derivative;
             NaN where there is no mask.
         milliseconds: of a call with all views, forward and backward.
     """
@@ -148,12 +148,15 @@ def measure_averages(contender: Contender, workload: Workload, repeats: int) -> 
 
 
 def _deviations(contender: Contender, workload: Workload, repeats: int, calls: tuple[int, ...]) -> Float[np.ndarray, "2 N"]:
-    """Root mean square over orientations and motions, as a share of each orientation's largest derivative."""
-    squares = []
+    """Root mean square over motions, median over orientations, as a share of an orientation's largest derivative, on average.
+
+    The median, since a rare sample on a face that is seen nearly edge-on outweighs all others of its orientation.
+    """
+    variances, scales = [], []
     for turned in orientations(workload.vertices):
         motions = body_motions(turned)
         samples = np.stack([contender.derivatives(turned, motions, seed) for seed in range(1, repeats + 1)])
-        scale = np.abs(samples.mean(axis=0)).max(axis=1)
         means = [samples.reshape(-1, count, *samples.shape[1:]).mean(axis=1) for count in calls]
-        squares.append([mean.var(axis=0, ddof=1).mean(axis=1) / scale**2 for mean in means])
-    return np.sqrt(np.mean(squares, axis=0)).T
+        variances.append([mean.var(axis=0, ddof=1).mean(axis=1) for mean in means])
+        scales.append(np.abs(samples.mean(axis=0)).max(axis=1))
+    return (np.sqrt(np.median(variances, axis=0)) / np.mean(scales, axis=0)).T
