@@ -86,7 +86,7 @@ class LightSettings:
 
     scene: str = "dome"  # a file of scenes/, without its ending, or a path to an XML file
     background: float = 0.06  # linear radiance of the constant backdrop
-    samples_per_pixel: int = 9  # camera rays; a square number stratifies best
+    samples_per_pixel: int = 8  # camera rays, stratified
     light_samples: int = 3  # paths that go on from each camera ray's hit
     max_depth: int = 3  # segments of a path, counting the camera's: 3 is one bounce of indirect light
     occlusion_size: int = 64  # texels along a side of the true ambient occlusion, kept for scoring; 0 keeps none
