@@ -41,7 +41,7 @@ class BenchCommand:
     figure: Path | None = None  # draw the derivative of each pixel beside finite differences here, and time nothing
     noise: bool = False  # measure the noise of gradients at different sample counts instead
     bias: bool = False  # hold mean gradients against finite differences instead
-    rounds: int = 7  # turns of each contender; --noise and --bias take so many times more seeds
+    rounds: int = 7  # turns of each contender; with --noise and --bias, seeds grow with it
     variant: str = "auto"  # Mitsuba variant
 
 

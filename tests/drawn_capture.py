@@ -5,6 +5,7 @@ not black. Five cameras of 40x56 pixels, the last one held out; eight training a
 what was learnt can be compared with the truth.
 """
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -129,3 +130,14 @@ def _posed(rig: Rig, theta: np.ndarray, root: np.ndarray) -> np.ndarray:
         transforms = Skeleton(rig)(torch.from_numpy(theta), torch.from_numpy(root))
         rest = torch.from_numpy(rig.rest_vertices + bulge(rig, theta))
         return pose_vertices(rest, transforms, torch.from_numpy(rig.skinning_weights)).numpy()
+
+
+def copy_with_a_wider_held_out_camera(capture: Capture, folder: Path) -> Path:
+    """Copy a capture, without its pictures, to `folder`; there the first camera is 64 pixels wide and held out too."""
+    shutil.copytree(capture.path, folder, ignore=shutil.ignore_patterns("*.png"))
+    document = json.loads((folder / "cameras.json").read_text())
+    document["cameras"][0]["width"] = 64
+    (folder / "cameras.json").write_text(json.dumps(document))
+    description = folder / "capture.yaml"
+    description.write_text(description.read_text().replace(f"- {HELD_OUT}", f"- {HELD_OUT}\n- front"))
+    return folder

@@ -10,7 +10,7 @@ import torch
 
 from mitsuba_avatar.captures.images import read_image
 from mitsuba_avatar.drive import main
-from tests.drawn_capture import HEIGHT, HELD_OUT, WIDTH
+from tests.drawn_capture import HEIGHT, WIDTH, copy_with_a_wider_held_out_camera
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -48,12 +48,7 @@ def test_held_out_cameras_see_the_driven_person_where_the_capture_has_it(fitted_
 
 
 def test_held_out_cameras_of_several_sizes_make_one_video_and_pictures_of_their_own(fitted_run, drawn_capture, private_cache, tmp_path):
-    shutil.copytree(drawn_capture.path, tmp_path / "copy", ignore=shutil.ignore_patterns("*.png"))
-    document = json.loads((tmp_path / "copy/cameras.json").read_text())
-    document["cameras"][0]["width"] = 64
-    (tmp_path / "copy/cameras.json").write_text(json.dumps(document))
-    description = tmp_path / "copy/capture.yaml"
-    description.write_text(description.read_text().replace(f"- {HELD_OUT}", f"- {HELD_OUT}\n- front"))
+    copy_with_a_wider_held_out_camera(drawn_capture, tmp_path / "copy")
     words = ("--pose", str(tmp_path / "copy"), "--path", "held_out", "--format", "png", "mp4", "--split", "test")
     assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
     assert [read_image(tmp_path / f"out/{row:06d}.png").shape for row in (0, 1)] == [(HEIGHT, 64, 3), (HEIGHT, WIDTH, 3)]

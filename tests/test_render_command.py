@@ -15,7 +15,7 @@ from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.captures.images import read_image
 from mitsuba_avatar.render import main
 from mitsuba_avatar.reporting.exr import read_exr
-from tests.drawn_capture import HEIGHT, HELD_OUT, WIDTH
+from tests.drawn_capture import HEIGHT, HELD_OUT, WIDTH, copy_with_a_wider_held_out_camera
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -104,12 +104,7 @@ def test_a_capture_without_held_out_cameras_has_none_to_render(fitted_run, drawn
 
 def test_held_out_cameras_of_several_sizes_keep_them_and_meet_in_the_video(fitted_run, drawn_capture, private_cache, tmp_path):
     """The smaller camera sees what it sees alone; in the video it is centred on the backdrop."""
-    shutil.copytree(drawn_capture.path, tmp_path / "copy", ignore=shutil.ignore_patterns("*.png"))
-    document = json.loads((tmp_path / "copy/cameras.json").read_text())
-    document["cameras"][0]["width"] = 64
-    (tmp_path / "copy/cameras.json").write_text(json.dumps(document))
-    description = tmp_path / "copy/capture.yaml"
-    description.write_text(description.read_text().replace(f"- {HELD_OUT}", f"- {HELD_OUT}\n- front"))
+    copy_with_a_wider_held_out_camera(drawn_capture, tmp_path / "copy")
     words = ("--capture", str(tmp_path / "copy"), "--path", "held_out", "--frames", "2", "--hold", "29", "--format", "mp4", "exr")
     assert main([str(fitted_run), *words, "--out", str(tmp_path / "out")]) == 0
     names = ("front_000029", f"{HELD_OUT}_000029")

@@ -22,6 +22,10 @@ class FaceBoxes:
     last_x: object
     last_y: object
 
+    def coarser(self, bits: int) -> tuple:
+        """First and last column, first and last row under the boxes, in squares of 2^bits units."""
+        return tuple(edge >> bits for edge in (self.first_x, self.last_x, self.first_y, self.last_y))
+
 
 @dataclass
 class SurfaceBatch:
@@ -65,6 +69,10 @@ class SurfaceBatch:
     def num_texels(self) -> int:
         """Texels of all textures together."""
         return self.num_views * self.texture_size[0] * self.texture_size[1]
+
+    def pixel_index(self, view_index, x, y):
+        """Index of a view's pixel among all B * H * W."""
+        return (view_index * self.film[1] + y) * self.film[0] + x
 
     def mesh_of(self, view_index):
         """Which mesh (UInt32) a view shows; a literal where there is but one, so that kernels do not look it up."""

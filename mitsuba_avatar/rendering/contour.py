@@ -216,7 +216,7 @@ def sample_contours(batch: SurfaceBatch, samples_per_edge: int) -> ContourSample
     return ContourSamples(
         view=view,
         view_index=view_index,
-        pixel=(view_index * height + mi.UInt32(position.y)) * width + mi.UInt32(position.x),
+        pixel=batch.pixel_index(view_index, mi.UInt32(position.x), mi.UInt32(position.y)),
         active=active,
         vertices=ends,
         points=(point_a, point_b),

@@ -1,8 +1,8 @@
 """Which face each of many positions on the films shows first: every face asks the positions under its bounding box.
 
-A face is a lane. It goes through the samples of the pixels under its box (`rasterize_pixels`), or through any positions at all, sorted
-into rows of bins beforehand (`nearest_faces`), and where it covers one it enters itself by an atomic maximum of (closeness, face). Faces of
-a body are far more than what each covers, so this is little work for a lane, the face stays in registers, and a test reads two numbers;
+A face is a lane. It goes through the samples of the pixels under its box (`visibility.rasterize_pixels`), or through any positions at
+all, sorted into rows of bins beforehand (`nearest_faces`), and where it covers one it enters itself by an atomic maximum of (closeness,
+face). Faces of a body are many and small, so this is little work for a lane, the face stays in registers, and a test reads two numbers;
 where instead a position goes through the faces near it, a test reads twelve, from anywhere.
 """
 
@@ -93,13 +93,13 @@ class NearestFaces:
         dr.scatter_reduce(dr.ReduceOp.Max, self.keys, key, slot, active, mode=dr.ReduceMode.Direct)
 
     def at(self, slot, active=True) -> tuple:
-        """Whether there is a winner, its face, and its closeness."""
+        """Whether there is a winner, and its face (0 where there is none)."""
         import drjit as dr
 
         mi = loaded_mitsuba()
         key = dr.gather(_key_type(), self.keys, slot, active)
         is_met = key != 0
-        return is_met, dr.select(is_met, ~mi.UInt32(key & 0xFFFFFFFF), 0), dr.reinterpret_array(mi.Float, mi.UInt32(key >> 32))
+        return is_met, dr.select(is_met, ~mi.UInt32(key & 0xFFFFFFFF), 0)
 
 
 def _key_type():
@@ -134,9 +134,7 @@ def nearest_faces(batch: SurfaceBatch, view_index, position, active) -> tuple:
     nearest = NearestFaces.none(dr.width(x))
     boxes = batch.boxes
     projected = ProjectedFace.of(batch.corner_points(boxes.view_index, boxes.face))
-    first_row, last_row, first_column, last_column = (
-        edge >> units.bin_bits for edge in (boxes.first_y, boxes.last_y, boxes.first_x, boxes.last_x)
-    )
+    first_column, last_column, first_row, last_row = boxes.coarser(units.bin_bits)
     first_bin = boxes.view_index * (across * down)
 
     def rays_of(row, active) -> tuple:
@@ -161,5 +159,5 @@ def nearest_faces(batch: SurfaceBatch, view_index, position, active) -> tuple:
         body=test,
         labels=("row", "ray", "end"),
     )
-    is_met, face, _ = nearest.at(slot, active)
+    is_met, face = nearest.at(slot, active)
     return is_met & active, face

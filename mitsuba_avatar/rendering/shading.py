@@ -74,7 +74,7 @@ def scatter_image(batch: SurfaceBatch, hits: Hits, radiance, image, mask) -> Non
         labels=("sample", "total"),
     )
     view_index, x, y = hits.tiles.pixel_of_slot(lane)
-    pixel = (view_index * batch.film[1] + y) * batch.film[0] + x
+    pixel = batch.pixel_index(view_index, x, y)
     is_on_film = (x < batch.film[0]) & (y < batch.film[1])
     _write_pixels(batch, pixel, view_index, total * (1.0 / count), image, mask, is_on_film)
 

@@ -98,8 +98,7 @@ def find_tiles(batch: SurfaceBatch) -> Tiles:
     mi = loaded_mitsuba()
     bits, boxes = tile_bits(batch.film), batch.boxes
     across, down = (-(-pixels >> bits) for pixels in batch.film)
-    shift = FilmUnits.of(batch.film).pixel_bits + bits
-    first_x, first_y, last_x, last_y = (edge >> shift for edge in (boxes.first_x, boxes.first_y, boxes.last_x, boxes.last_y))
+    first_x, last_x, first_y, last_y = boxes.coarser(FilmUnits.of(batch.film).pixel_bits + bits)
     first_tile = boxes.view_index * (across * down)
     touched = dr.zeros(mi.Bool, batch.num_views * across * down)
 
@@ -126,13 +125,12 @@ def rasterize_pixels(batch: SurfaceBatch, tiles: Tiles) -> NearestFaces:
     nearest = NearestFaces.none((len(tiles.index) << (2 * tiles.bits)) * count)
     projected = ProjectedFace.of(batch.corner_points(boxes.view_index, boxes.face))
     view = View.gather(batch.views, boxes.view_index)
-    shift = FilmUnits.of(batch.film).pixel_bits
-    first_x, first_y, last_x, last_y = (edge >> shift for edge in (boxes.first_x, boxes.first_y, boxes.last_x, boxes.last_y))
+    first_x, last_x, first_y, last_y = boxes.coarser(FilmUnits.of(batch.film).pixel_bits)
     at_once = next(number for number in range(min(count, SAMPLES_AT_ONCE), 0, -1) if count % number == 0)
 
     def test(x, y, sample):
         slot = tiles.first_slot(boxes.view_index, x, y) * count + sample
-        pixel_offset = random_shift((boxes.view_index * batch.film[1] + y) * batch.film[0] + x, PIXELS, batch.seed, count)
+        pixel_offset = random_shift(batch.pixel_index(boxes.view_index, x, y), PIXELS, batch.seed, count)
         for k in range(at_once):
             position = mi.Point2f(x, y) + jitter(pixel_offset, sample + k, count)
             is_met, closeness = projected.meets(*normalized(view, position))
@@ -168,8 +166,8 @@ def trace_views(batch: SurfaceBatch) -> Hits | None:
         return None
     mi = loaded_mitsuba()
     view_index, x, y = tiles.pixel_of_slot(slot // count)
-    _, face, _ = nearest.at(slot)
-    pixel = (view_index * batch.film[1] + y) * batch.film[0] + x
+    _, face = nearest.at(slot)
+    pixel = batch.pixel_index(view_index, x, y)
     position = mi.Point2f(x, y) + jitter(random_shift(pixel, PIXELS, batch.seed, count), slot % count, count)
     barycentric, depth = meeting_point(batch, View.gather(batch.views, view_index), view_index, face, position)
     return Hits(len(slot), pixel, view_index, slot, len(nearest.keys), face, barycentric, depth, tiles)
