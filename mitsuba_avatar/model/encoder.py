@@ -2,7 +2,9 @@
 
 Its last layer begins small, so that the posterior begins near the prior, and is scaled by the root of its inputs ("equalized learning
 rate", arXiv:1710.10196). Adam moves every one of its thousand weights by the learning rate at each step; unscaled, `logvar` jumps by
-several units at once, exp(logvar) explodes, and at a low KL weight training ends there.
+several units at once, exp(logvar) explodes, and at a low KL weight training ends there. The layer's inputs are divided by
+sqrt(1 + their mean square): a frame whose clothes are far from where they usually are then has a code in its own direction, but no
+farther out. Undivided, single frames reached 700 nats where the rest had 12, enough to skip the step.
 
 It sees what the driving signal cannot tell: the registered vertices, unposed, minus the template, drawn as a map over the texture
 atlas. Convention of the whole project: `logvar` is the logarithm of the variance, so std = exp(0.5 * logvar).
@@ -66,5 +68,7 @@ class Encoder(nn.Module):
             offsets: [P, 3, S, S] unposed registered surface minus template, in units of `displacement_scale`, S = encoder_size.
         """
         features = self.convolutions(channels_last(offsets.clamp(-LARGEST_OFFSET, LARGEST_OFFSET)))
-        mu, logvar = self.head(self.head_scale * features.flatten(1)).chunk(2, dim=1)  # [P, Z] each
+        features = features.flatten(1)
+        features = features / (1 + features.square().mean(1, keepdim=True)).sqrt()  # root mean square below one
+        mu, logvar = self.head(self.head_scale * features).chunk(2, dim=1)  # [P, Z] each
         return Posterior(mu, logvar)

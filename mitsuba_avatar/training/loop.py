@@ -24,6 +24,7 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.model.keypoints import DrivenKeypoints, lists_face_landmarks
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.settings import Settings
@@ -136,7 +137,7 @@ class Trainer:
         weights = self._weights(batch)
         problem = None
         try:
-            terms, latents = self._losses(batch, weights)
+            terms, posterior = self._losses(batch, weights)
             loss = weighted_sum(terms, weights)
             self._require_calm(float(loss.detach()), terms, weights, batch)
         except DivergedError as error:
@@ -155,9 +156,9 @@ class Trainer:
             self.optimizer.step()
             if self.response is not None:
                 self.response.step(self.learning_rate(self.iteration) / self.settings.training.learning_rate, self.process)
-        if self.information is not None and latents is not None:
+        if self.information is not None and posterior is not None:
             with self.timer.part("information"):
-                self.information.observe(latents, self.avatar.standardized_driving(batch.theta, batch.face))
+                self.information.observe(posterior, self.avatar.standardized_driving(batch.theta, batch.face))
         self.timer.steps += 1
         values = self._mean_over_ranks(torch.stack([loss.detach(), *(value.detach() for value in terms.values())]))
         means = dict(zip(("loss", *terms), values.tolist(), strict=True))
@@ -235,8 +236,8 @@ class Trainer:
             absent = (*absent, "geometry", "laplacian")
         return {name: weight for name, weight in weights.items() if name not in absent}
 
-    def _losses(self, batch: FrameBatch, weights: dict[str, float]) -> tuple[dict[str, Tensor], Tensor | None]:
-        """Loss terms of a batch, and the latent codes that it was decoded with."""
+    def _losses(self, batch: FrameBatch, weights: dict[str, float]) -> tuple[dict[str, Tensor], Posterior | None]:
+        """Loss terms of a batch, and the posterior that its latent codes were drawn from."""
         noise = self.latent_noise(len(batch.frames)).to(self.device)
         if "image" in weights or "mask" in weights:
             inputs = self._rendered(batch, noise)
@@ -246,7 +247,7 @@ class Trainer:
         with self.timer.part("losses"):
             terms = evaluate_losses(self._with_disentanglement(inputs, batch, latents), weights)
         self._require_finite("loss term", {name: value.detach() for name, value in terms.items()}, batch)
-        return terms, latents
+        return terms, inputs.posterior
 
     def _rendered(self, batch: FrameBatch, noise: Tensor) -> LossInputs:
         """Surface and pictures of a batch, beside what they should be."""

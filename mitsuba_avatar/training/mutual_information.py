@@ -1,9 +1,10 @@
 """How much the latent code tells about the driving signal, estimated while the avatar trains, and the penalty on it.
 
-The statistics network (model/disentanglement.py) learns from a memory of recent pairs (z, c), not from the current batch: a batch of
-a few poses has nearly nothing to shuffle, and its estimate is worthless. Codes in the memory are up to a thousand steps old; the
-network follows the encoder, which moves slowly. The avatar is penalised on the codes of the current batch alone, paired with their own
-driving signals and with remembered ones.
+The statistics network (model/disentanglement.py) learns from a memory of recent posteriors q(z) and their driving signals c, not from the
+current batch: a batch of a few poses has nearly nothing to shuffle, and its estimate is worthless. Every update draws its codes from
+the posteriors anew; a network that saw one draw of each would learn that draw's noise by heart, and see nothing on a frame that it meets
+again. Posteriors in the memory are up to a few hundred steps old; the network follows the encoder, which moves slowly. The avatar is
+penalised on the codes of the current batch alone, paired with their own driving signals and with remembered ones.
 
 The running estimate is taken on every batch *before* the network learns from it, and where it is zero or less there is no penalty. Without
 this the penalty invents a leak: a network that has learnt its memory by heart sees structure in codes that are pure noise, and the
@@ -30,6 +31,7 @@ from mitsuba_avatar.model.disentanglement import (
     mismatched,
     mutual_information_bound,
 )
+from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.settings import DisentanglementSettings
 from mitsuba_avatar.training.collectives import average_gradients, gather_rows
 from mitsuba_avatar.training.distributed import Process
@@ -40,6 +42,7 @@ MISMATCHES = 4  # shuffles of a mini-batch; the mean of exp(f) is far noisier th
 DRIFT_WEIGHT = 0.1
 ESTIMATE_RATE = 0.05  # of the moving average of mini-batch estimates
 SEED_STRIDE = 1 << 20
+MISMATCH_STREAMS, ROW_STREAMS, NOISE_STREAMS = 0, 1 << 10, 2 << 10  # of random numbers, of one number of pairs seen
 
 
 class MutualInformation:
@@ -68,7 +71,8 @@ class MutualInformation:
             torch.manual_seed(seed)
             self.network = StatisticsNetwork(latent_size, driving_size, settings.statistics_channels).to(device)
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=settings.statistics_learning_rate, fused=True)
-        self.latents = torch.zeros(settings.memory, latent_size, device=device)
+        self.mu = torch.zeros(settings.memory, latent_size, device=device)
+        self.logvar = torch.zeros(settings.memory, latent_size, device=device)
         self.driving = torch.zeros(settings.memory, driving_size, device=device)
         self.seen = 0  # pairs observed so far; the memory is a ring
         self.mean_exp = 1.0  # moving average of E[exp f] over mismatched pairs
@@ -96,28 +100,27 @@ class MutualInformation:
         slope = corrected_objective(joint, product, self.mean_exp)
         return slope - slope.detach() + self.estimate
 
-    def observe(self, z: Float[Tensor, "P Z"], driving: Float[Tensor, "P D"]) -> None:
-        """Remember a batch's pairs (of all ranks) and train the statistics network on the memory. All ranks must call it."""
-        z, driving = gather_rows(z.detach(), self.process), gather_rows(driving.detach(), self.process)
+    def observe(self, posterior: Posterior, driving: Float[Tensor, "P D"]) -> None:
+        """Remember a batch's posteriors (of all ranks) and train the statistics network on the memory. All ranks must call it."""
+        rows = [gather_rows(values.detach(), self.process) for values in (posterior.mu, posterior.logvar, driving)]
         if self.seen >= FEWEST_PAIRS:
-            self._judge(z, driving)
-        slots = ((self.seen + torch.arange(len(z))) % len(self.latents)).to(z.device)
-        self.latents[slots], self.driving[slots] = z, driving
-        self.seen += len(z)
+            self._judge(Posterior(*rows[:2]), rows[2])
+        slots = ((self.seen + torch.arange(len(rows[0]))) % len(self.mu)).to(rows[0].device)
+        self.mu[slots], self.logvar[slots], self.driving[slots] = rows
+        self.seen += len(slots)
         if self.seen < FEWEST_PAIRS:
             return
-        held = min(self.seen, len(self.latents))
-        self.network.standardize_by(self.latents[:held], self.driving[:held])
+        held = self._held()
+        self.network.standardize_by(self._sample(Posterior(self.mu[:held], self.logvar[:held]), 0), self.driving[:held])
         for update in range(self.settings.updates):
-            self._update(update)
+            self._update(1 + update)
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed run must know."""
         return {
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "latents": self.latents,
-            "driving": self.driving,
+            "memory": [self.mu, self.logvar, self.driving],
             "numbers": [self.seen, self.mean_exp, self.running],
         }
 
@@ -127,8 +130,9 @@ class MutualInformation:
         Raises:
             ValueError: memory or network have other sizes.
         """
-        was = [len(state["latents"]), state["network"]["score.weight"].shape[1]]
-        wanted = [len(self.latents), self.settings.statistics_channels]
+        memory = state["memory"]
+        was = [len(memory[0]), state["network"]["score.weight"].shape[1]]
+        wanted = [len(self.mu), self.settings.statistics_channels]
         if was != wanted:
             raise ValueError(
                 f"MutualInformation: expected disentanglement.memory and disentanglement.statistics_channels of {was}, as the run began; "
@@ -136,22 +140,23 @@ class MutualInformation:
             )
         self.network.load_state_dict(state["network"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.latents.copy_(state["latents"])
-        self.driving.copy_(state["driving"])
+        for own, saved in zip((self.mu, self.logvar, self.driving), memory, strict=True):
+            own.copy_(saved)
         self.seen, self.mean_exp, self.running = state["numbers"]
 
-    def _judge(self, z: Tensor, driving: Tensor) -> None:
+    def _judge(self, posterior: Posterior, driving: Tensor) -> None:
         """Average the bound of pairs that the network has not seen into the running estimate."""
+        z = self._sample(posterior, 0)
         with torch.no_grad():
             bound = mutual_information_bound(self.network(z, driving), self.network(z[:, None], self.driving[self._draw(0)][None]))
         self.running = (1 - ESTIMATE_RATE) * self.running + ESTIMATE_RATE * float(bound)
 
-    def _update(self, update: int) -> None:
+    def _update(self, stream: int) -> None:
         """One step of the statistics network up the bound."""
-        rows = self._draw(1 + update)
-        z, driving = self.latents[rows], self.driving[rows]
+        rows = self._draw(stream)
+        z, driving = self._sample(Posterior(self.mu[rows], self.logvar[rows]), stream), self.driving[rows]
         joint = self.network(z, driving)
-        product = self.network(z[None], mismatched(driving, MISMATCHES, self._generator(1 + update)))
+        product = self.network(z[None], mismatched(driving, MISMATCHES, self._generator(MISMATCH_STREAMS + stream)))
         rate = self.settings.moving_average
         self.mean_exp = (1 - rate) * self.mean_exp + rate * float(product.detach().exp().mean())
         loss = DRIFT_WEIGHT * log_mean_exp(product).square() - corrected_objective(joint, product, self.mean_exp)
@@ -160,11 +165,19 @@ class MutualInformation:
         average_gradients(self.network.parameters(), self.process)
         self.optimizer.step()
 
+    def _held(self) -> int:
+        """Rows of the memory that are filled."""
+        return min(self.seen, len(self.mu))
+
     def _draw(self, stream: int) -> Tensor:
         """Random rows of the memory."""
-        held = min(self.seen, len(self.latents))
-        rows = torch.randint(held, (self.settings.pairs,), generator=self._generator(2**10 + stream))
-        return rows.to(self.latents.device)
+        rows = torch.randint(self._held(), (self.settings.pairs,), generator=self._generator(ROW_STREAMS + stream))
+        return rows.to(self.mu.device)
+
+    def _sample(self, posterior: Posterior, stream: int) -> Tensor:
+        """Codes drawn from posteriors."""
+        noise = torch.randn(posterior.mu.shape, generator=self._generator(NOISE_STREAMS + stream))
+        return posterior.sample(noise.to(posterior.mu))
 
     def _generator(self, stream: int) -> torch.Generator:
         """Random numbers that follow from the seed and from what was seen, so that a resumed run draws the same."""

@@ -45,6 +45,19 @@ def test_a_vertex_flung_away_does_not_drown_the_others(settings):
     assert torch.equal(posterior.mu[0], posterior.mu[1])
 
 
+def test_a_surface_far_from_all_others_sends_its_code_no_farther_than_an_ordinary_one(settings):
+    """Ten times the offsets: a code in the same direction, not ten times as far, which the KL term would square."""
+    torch.manual_seed(0)
+    encoder = Encoder(settings)
+    with torch.no_grad():
+        for layer in encoder.convolutions[::2]:
+            layer.weight *= 4.0  # as training grows them
+    offsets = torch.randn(2, 3, settings.encoder_size, settings.encoder_size).clamp(-1, 1)
+    ordinary, far = encoder(offsets).mu, encoder(10.0 * offsets).mu
+    assert torch.nn.functional.cosine_similarity(ordinary, far).min() > 0.9
+    assert (far.norm(dim=1) < 1.5 * ordinary.norm(dim=1)).all()
+
+
 def test_gradient_equals_finite_differences():
     torch.manual_seed(0)
     encoder = Encoder(ModelSettings(latent_size=3, encoder_size=8, encoder_channels=(3, 4))).double()

@@ -6,6 +6,7 @@ import json
 import pytest
 import torch
 
+from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.checkpoints import Checkpoints
 from mitsuba_avatar.training.distributed import Process
@@ -197,10 +198,8 @@ def test_the_perturbation_term_keeps_random_codes_from_moving_the_keypoints(make
 def test_information_is_observed_and_penalised(make_trainer):
     trainer = make_trainer("loss.mutual_information=0.1", "training.iterations=2")
     batch = trainer.reader.read(*trainer.sampler.draw(0))
-    trainer.information.observe(
-        torch.randn((100, 16), generator=torch.Generator().manual_seed(0)),
-        torch.randn((100, 8), generator=torch.Generator().manual_seed(1)),
-    )
+    mu, logvar = torch.randn((2, 100, 16), generator=torch.Generator().manual_seed(0))
+    trainer.information.observe(Posterior(mu, logvar), torch.randn((100, 8), generator=torch.Generator().manual_seed(1)))
     assert trainer.step(batch)["mutual_information"] >= 0
     assert trainer.information.seen == 102
     torch.testing.assert_close(trainer.information.driving[100:102], trainer.avatar.standardized_driving(batch.theta, batch.face))
@@ -208,7 +207,7 @@ def test_information_is_observed_and_penalised(make_trainer):
 
 def test_without_image_and_mask_nothing_is_read_nor_rendered_and_the_surface_learns_alone(make_trainer, reader, monkeypatch):
     rates = ("training.learning_rate=5e-3", "training.learning_rate_final=5e-3")
-    trainer = make_trainer("loss.image=0", "loss.mask=0", *rates, "training.iterations=30", reader=MemoryReader(reader))
+    trainer = make_trainer("loss.image=0", "loss.mask=0", *rates, "training.iterations=40", reader=MemoryReader(reader))
     monkeypatch.setattr(trainer.renderer, "render", None)
     monkeypatch.setattr(trainer.reader, "read", None)
     terms = run(trainer)
