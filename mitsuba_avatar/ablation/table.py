@@ -14,7 +14,11 @@ from mitsuba_avatar.ablation.plan import PlannedRun
 from mitsuba_avatar.ablation.rows import Row
 from mitsuba_avatar.files import atomic_path
 
-HEADINGS = ("model", "train", "validation", "test", "gap", "KL (nats)", "active", "MI (nats)", "paper train", "paper test")
+LATENT_FIGURES = ("kl_nats", "active_entries", "frame_information_nats", "mutual_information_nats")  # of a run's measures
+LATENT_DECIMALS = (1, 0, 2, 2)
+LATENT_HEADINGS = ("KL (nats)", "active", "I(z; frame)", "I(z; drive)")  # the same, as the table calls them
+HEADINGS = ("model", "train", "validation", "test", "over ours", "gap", *LATENT_HEADINGS, "paper train", "paper test")
+REFERENCE = "ours"  # row that the others are compared with, seed by seed
 
 
 @dataclass(frozen=True)
@@ -36,14 +40,16 @@ class Spread:
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of the table; errors by split, None where the capture has no such frames or the avatar no latent code."""
+    """A row of the table; errors by split, None where the capture has no such frames or the avatar no latent code.
+
+    What the latent code says is measured as in reporting/disentanglement.py, in nats.
+    """
 
     row: Row
     seeds: int
     errors: dict[str, Spread]
-    kl_nats: Spread | None
-    active_entries: Spread | None
-    mutual_information: Spread | None
+    excesses: tuple[float, ...]  # per cent that the test error is above that of ours with the same seed; none for ours itself
+    latent: tuple[Spread | None, ...]  # LATENT_FIGURES
 
     @property
     def gap(self) -> float | None:
@@ -54,18 +60,25 @@ class Entry:
 def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
     """One entry for each row, over the seeds that are measured; rows without any are left out."""
     entries = []
+    measures: dict[Row, list[dict]] = {}
+    for run in runs:
+        if run.is_measured:
+            measures.setdefault(run.row, []).append(run.measures())
+    ours = {one["seed"]: driven_errors(one).get("test") for row, ones in measures.items() if row.name == REFERENCE for one in ones}
     for row in dict.fromkeys(run.row for run in runs):
-        measured = [run.measures() for run in runs if run.row == row and run.is_measured]
+        measured = measures.get(row, [])
         if not measured:
             continue
         errors = [driven_errors(one) for one in measured]
         parts = [one.get("disentanglement", {}) for one in measured]
+        pairs = [(error["test"], ours[one["seed"]]) for error, one in zip(errors, measured, strict=True) if ours.get(one["seed"])]
         entries.append(
             Entry(
                 row,
                 len(measured),
                 {split: Spread.of([one[split] for one in errors]) for split in errors[0]},
-                *(_spread(parts, name) for name in ("kl_nats", "active_entries", "mutual_information_nats")),
+                tuple(100 * (test / reference - 1) for test, reference in pairs) if row.name != REFERENCE else (),
+                tuple(_spread(parts, name) for name in LATENT_FIGURES),
             )
         )
     return entries
@@ -80,16 +93,17 @@ def driven_errors(measures: dict) -> dict[str, float]:
 
 
 def markdown(entries: Sequence[Entry]) -> str:
-    """The table as Markdown; the lowest train and test errors are bold."""
+    """The table as Markdown; the lowest train and test errors are bold. "over ours": test error above that of ours with the same seed, mean
+    and deviation over seeds, and in how many seeds it is above."""
     lines = ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
-    lines += ["| " + " | ".join(_cells(entry, entries, "**{}**", " ± ")) + " |" for entry in entries]
+    lines += ["| " + " | ".join(_cells(entry, entries, "**{}**", " ± ", "%")) + " |" for entry in entries]
     return "\n".join(lines) + "\n"
 
 
 def latex(entries: Sequence[Entry]) -> str:
     """The table as a LaTeX tabular for the package booktabs."""
     lines = [r"\begin{tabular}{l" + "r" * (len(HEADINGS) - 1) + "}", r"\toprule", " & ".join(HEADINGS) + r" \\", r"\midrule"]
-    lines += [" & ".join(_cells(entry, entries, r"\textbf{{{}}}", r" $\pm$ ")) + r" \\" for entry in entries]
+    lines += [" & ".join(_cells(entry, entries, r"\textbf{{{}}}", r" $\pm$ ", r"\%")) + r" \\" for entry in entries]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
@@ -111,7 +125,7 @@ def write_tables(folder: Path, runs: Sequence[PlannedRun]) -> list[Entry]:
     return entries
 
 
-def _cells(entry: Entry, entries: Sequence[Entry], bold: str, between: str) -> list[str]:
+def _cells(entry: Entry, entries: Sequence[Entry], bold: str, between: str, percent: str) -> list[str]:
     """A row's cells, without the rules between them."""
 
     def error(split: str) -> str:
@@ -124,10 +138,14 @@ def _cells(entry: Entry, entries: Sequence[Entry], bold: str, between: str) -> l
     def optional(value: Spread | None, decimals: int) -> str:
         return "-" if value is None else value.text(between, decimals)
 
+    excess = "-"
+    if entry.excesses:
+        worse = sum(value > 0 for value in entry.excesses)
+        excess = f"{Spread.of(entry.excesses).text(between, 0)} {percent} ({worse} of {len(entry.excesses)})"
     gap = "-" if entry.gap is None else f"{entry.gap:.2f}"
     published = ["-", "-"] if entry.row.published is None else [f"{value:.3f}" for value in entry.row.published]
-    latent = [optional(entry.kl_nats, 1), optional(entry.active_entries, 0), optional(entry.mutual_information, 2)]
-    return [entry.row.title, error("train"), error("validation"), error("test"), gap, *latent, *published]
+    latent = [optional(value, decimals) for value, decimals in zip(entry.latent, LATENT_DECIMALS, strict=True)]
+    return [entry.row.title, error("train"), error("validation"), error("test"), excess, gap, *latent, *published]
 
 
 def _spread(parts: Sequence[dict], name: str) -> Spread | None:

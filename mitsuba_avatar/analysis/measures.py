@@ -184,9 +184,9 @@ def disentanglement(study: Study, seed: int = 0) -> dict:
     """How far latent code and driving signal are apart; an avatar without a latent code has nothing to tell but `spurious`.
 
     Returns:
-        `spurious` (see `spurious_effects`); `kl_nats`, `active_entries` over training frames; `mutual_information_nats` by a fresh
-        estimator; `latent_swap` and `drive_swap` on test frames; `hidden_state_r2`, what a linear probe reads off z of the garment's
-        state that pose does not tell, on test frames (where the truth is known).
+        `spurious` (see `spurious_effects`); `LatentUse` over training frames; `mutual_information_nats` by a fresh estimator;
+        `latent_swap` and `drive_swap` on test frames; `hidden_state_r2`, what a linear probe reads off z of the garment's state that
+        pose does not tell, on validation and test frames (where the truth is known).
     """
     result: dict = {"spurious": spurious_effects(study, seed)}
     if study.posterior is None:
@@ -194,8 +194,7 @@ def disentanglement(study: Study, seed: int = 0) -> dict:
     train, judged = study.frames("train"), study.frames("test") or study.frames("train")
     posterior = Posterior(study.posterior.mu[train], study.posterior.logvar[train])
     driving = study.avatar.standardized_driving(study.drive.theta, study.drive.face)
-    use = latent_use(posterior)
-    result |= {"kl_nats": use.kl_nats, "active_entries": use.active_entries}
+    result |= asdict(latent_use(posterior, seed))
     if len(train) >= FEWEST_FRAMES:
         result["mutual_information_nats"] = fresh_mutual_information(posterior, driving[train], seed=seed)
     rows = torch.tensor(judged)
@@ -204,10 +203,14 @@ def disentanglement(study: Study, seed: int = 0) -> dict:
     keypoints, groups = study.keypoints(), study.groups()
     result["latent_swap"] = asdict(latent_swap(study.avatar, keypoints, drive, z, z[others], groups))
     result["drive_swap"] = asdict(drive_swap(study.avatar, keypoints, drive.chosen(others.tolist()), z, groups))
-    if study.garment is not None and judged != train:
+    if study.garment is not None:
         hidden = _hidden_state(study, train)
         mu = study.posterior.mu.double().numpy()
-        result["hidden_state_r2"] = linear_probe(mu[train], hidden[train], mu[judged], hidden[judged])
+        result["hidden_state_r2"] = {
+            split: linear_probe(mu[train], hidden[train], mu[rows], hidden[rows])
+            for split in ("validation", "test")
+            if (rows := study.frames(split))
+        }
     return result
 
 

@@ -6,6 +6,7 @@ can be repeated on the same ones for another avatar. Distances in millimetres, i
 Symbols: N frames, Z latent size, D entries of the driving signal, V vertices, T entries of a target state.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -28,13 +29,24 @@ LEARNING_RATE = 1e-3
 CHECK_EVERY = 25  # steps between looks at the validation frames
 JUDGED_MISMATCHES = 32  # shuffles of the frames that an estimator is judged on
 DECODED_AT_ONCE = 8  # frames
+DRAWS = 4  # codes of every frame that its information is averaged over
+BLOCK_FRAMES = 4  # of an estimator's train, stop and judge groups
 
 
 @dataclass(frozen=True)
 class LatentUse:
-    """How much an encoder says: nats per frame, and how many entries of z say anything."""
+    """How much an encoder says: nats per frame, and how many entries of z say anything.
+
+    Attributes:
+        kl_nats: divergence of the posterior from the prior; it counts what a narrow or shifted posterior costs, whether or not it tells
+            frames apart.
+        frame_information_nats: mutual information between a drawn z and *which* of the frames it is of. An upper bound on what z tells of
+            anything about these frames, their driving signals included; at most the logarithm of their number.
+        active_entries: entries whose posterior mean varies between frames.
+    """
 
     kl_nats: float
+    frame_information_nats: float
     active_entries: int
 
 
@@ -53,40 +65,47 @@ class SwapDistances:
     vertices_mm: dict[str, float]
 
 
-def latent_use(posterior: Posterior) -> LatentUse:
-    """KL divergence from the prior, mean over frames, and the number of entries whose posterior mean varies between frames."""
+def latent_use(posterior: Posterior, seed: int = 0) -> LatentUse:
+    """What an encoder says about its frames, means over them.
+
+    Args:
+        posterior: of N frames.
+        seed: of the codes drawn for `frame_information_nats`.
+    """
     mu, logvar = posterior.mu.double(), posterior.logvar.double()
     nats = 0.5 * (mu.square() + logvar.exp() - 1 - logvar).sum(1).mean()
     active = (mu.var(0, correction=0) > ACTIVE_VARIANCE).sum()
-    return LatentUse(float(nats), int(active))
+    return LatentUse(float(nats), _frame_information(mu, logvar, seed), int(active))
 
 
 def fresh_mutual_information(
-    posterior: Posterior, driving: Float[Tensor, "N D"], blocks: int = 8, steps: int = 600, seed: int = 0
+    posterior: Posterior, driving: Float[Tensor, "N D"], block_frames: int = BLOCK_FRAMES, steps: int = 600, seed: int = 0
 ) -> float:
     """Mutual information between z ~ posterior and the driving signal, nats, by estimators trained from nothing.
 
-    The frames are cut into contiguous blocks, because neighbours resemble each other. One quarter of the blocks judges, one decides when
-    training stops, the rest trains; each quarter judges once, and the mean is reported. Judged on frames that it has not seen, the bound
-    cannot be raised by memorising; it is low where frames are few.
+    The frames are cut into short runs, dealt out in turn: one quarter of the runs judges, one decides when training stops, the rest trains;
+    each quarter judges once, and the mean is reported. Judged on frames that it has not seen, the bound cannot be raised by memorising
+    single frames, and it is low where frames are few. But a judge's neighbours in time are in the training runs: what is asked is what
+    z tells about the driving signal among poses like those of training. (With runs of eighty frames of a capture whose takes move one limb
+    each, the question becomes what one limb's take says about another's, and the answer was 0 for every code.)
 
     Args:
         posterior: of N frames in order of time; a fresh z is drawn from it at every step.
         driving: [N, D] standardised (`Avatar.standardized_driving`).
-        blocks: a multiple of 4.
+        block_frames: frames of a run.
         steps: of each of the four trainings.
         seed: of initial weights and draws.
 
     Raises:
-        ValueError: fewer than four frames a block, or blocks is no multiple of 4.
+        ValueError: fewer than four runs, or one of no frame.
     """
     count = len(driving)
-    if blocks < 4 or blocks % 4 or count < 4 * blocks:
+    if block_frames < 1 or count < 4 * block_frames:
         raise ValueError(
-            f"fresh_mutual_information(): expected blocks to be a multiple of 4 with at least 4 frames each; got {blocks} blocks of "
-            f"{count} frames. Use more frames or fewer blocks."
+            f"fresh_mutual_information(): expected block_frames of at least 1 and four runs of as many frames; got {block_frames} and "
+            f"{count} frames. Use more frames or shorter runs."
         )
-    quarter = (torch.arange(count) * blocks // count) % 4
+    quarter = (torch.arange(count) // block_frames) % 4
     bounds = []
     for judge in range(4):
         is_judge, is_stop = quarter == judge, quarter == (judge + 1) % 4
@@ -191,6 +210,19 @@ def drive_swap(
             shown = keypoints.from_surface(rest, part.theta, part.root)
             distances.append(((shown - asked).norm(dim=-1), (rest - neutral).norm(dim=-1)))
     return _swap_distances(distances, keypoints, vertex_groups)
+
+
+def _frame_information(mu: Float[Tensor, "N Z"], logvar: Float[Tensor, "N Z"], seed: int) -> float:
+    """E[log q(z | frame) - log mean over frames of q(z | frame)], over draws of z."""
+    generator = torch.Generator().manual_seed(seed)
+    precision, total = (-logvar).exp(), 0.0
+    for _ in range(DRAWS):
+        z = mu + (0.5 * logvar).exp() * torch.randn(mu.shape, generator=generator, dtype=mu.dtype).to(mu.device)
+        # Squared distances in each frame's own deviations, multiplied out: [N, N] without [N, N, Z] in between.
+        squares = z.square() @ precision.T - 2 * z @ (mu * precision).T + (mu.square() * precision).sum(1)
+        log_density = -0.5 * (squares + logvar.sum(1))  # [draw of frame i, density under frame j]
+        total += float((log_density.diagonal() - torch.logsumexp(log_density, 1)).mean()) + math.log(len(mu))
+    return total / DRAWS
 
 
 def _judged_bound(posterior: Posterior, driving: Tensor, groups: list[Tensor], steps: int, seed: int) -> float:

@@ -110,6 +110,21 @@ def test_latent_use_by_hand():
     assert use.kl_nats == pytest.approx(0.5 + 0.5 * (0.25 - 1 + math.log(4)))
 
 
+def test_codes_that_tell_frames_apart_with_certainty_carry_the_logarithm_of_their_number():
+    sure = Posterior(10.0 * torch.eye(7), torch.full((7, 7), -2.0))
+    assert latent_use(sure).frame_information_nats == pytest.approx(math.log(7), abs=1e-6)
+    alike = Posterior(torch.ones(7, 3), torch.full((7, 3), -6.0))
+    assert latent_use(alike).frame_information_nats == pytest.approx(0, abs=1e-9)
+    assert latent_use(alike).kl_nats > 5, "narrow and shifted, it costs nats all the same"
+
+
+def test_information_about_frames_is_that_of_a_gaussian_channel():
+    """Means spread with deviation s, noise of deviation 1: log(1 + s^2) / 2 for each entry, for as many frames as hide each other."""
+    mu = 0.8 * torch.randn((3000, 2), generator=torch.Generator().manual_seed(4))
+    found = latent_use(Posterior(mu, torch.zeros(3000, 2))).frame_information_nats
+    assert found == pytest.approx(math.log(1 + 0.8**2), rel=0.05)
+
+
 def leaking_posterior(frames: int, entries: int, correlation: float) -> tuple[Posterior, torch.Tensor]:
     """Codes correlated entry by entry with a driving signal of as many entries, and four idle entries on both sides."""
     generator = torch.Generator().manual_seed(1)
@@ -133,8 +148,8 @@ def test_a_fresh_estimate_of_independent_codes_is_zero_even_where_frames_could_b
 
 def test_too_few_frames_are_refused():
     posterior = Posterior(torch.zeros(31, 2), torch.zeros(31, 2))
-    with pytest.raises(ValueError, match="got 8 blocks of 31 frames"):
-        fresh_mutual_information(posterior, torch.zeros(31, 3))
+    with pytest.raises(ValueError, match="got 8 and 31 frames"):
+        fresh_mutual_information(posterior, torch.zeros(31, 3), block_frames=8)
 
 
 def test_a_linear_probe_finds_what_z_holds_and_nothing_more():
