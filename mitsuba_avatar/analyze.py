@@ -2,7 +2,7 @@
 
 Prints, and writes to report.json: how much the latent code says and what it tells about the driving signal, what swaps of codes and of
 driving signals move, chance correlations, distances from the true surface. Draws where controls act, where the avatar is unsure, and what
-inverse rendering gained. Captures given with --drives move the avatar, with every imputation of its latent code.
+inverse rendering gained. Captures given with --drives move the avatar, as its own test frames do, with every imputation of its latent code.
 """
 
 import json
@@ -29,7 +29,7 @@ class AnalyzeCommand:
 
     run: Annotated[Path, tyro.conf.Positional]  # run folder that fit or ablate wrote
     capture: str = ""  # another capture of the same rig; default: the one it was trained on
-    drives: tuple[str, ...] = ()  # captures whose test frames drive the avatar, each with every imputation of the latent code
+    drives: tuple[str, ...] = ()  # captures whose test frames drive the avatar, beside its own, with every imputation of the latent code
     out: str = ""  # where report and pictures go; default: RUN/analysis
     checkpoint: str = "last"  # best or last
     frames: int = 40  # of each split that geometry is measured on
@@ -94,12 +94,15 @@ def _analyze(command: AnalyzeCommand) -> int:
 
 
 def _imputations(command: AnalyzeCommand, loaded: "LoadedRun", study: "Study", progress: StageProgress) -> dict:
-    """Folder of each driving capture -> its setting, and the figures of every imputation."""
+    """Folder of each driving capture, the avatar's own first -> its setting, and the figures of every imputation."""
     from mitsuba_avatar.analysis.imputations import drive_of_capture, imputation_figures
     from mitsuba_avatar.driving.training_latents import training_latents
 
     run, avatar, result = loaded.run, loaded.avatar, {}
     training = training_latents(run, avatar, run.open_capture, command.checkpoint)
+    if own := study.frames("test"):
+        figures = imputation_figures(study, training, study.drive.chosen(own), exact=study.exact[own])
+        result[str(study.capture.path)] = {"setting": "matched", "notes": [], **figures}
     for done, path in enumerate(command.drives):
         progress.update("imputations", done, len(command.drives))
         drive = drive_of_capture(run, avatar, path, training)

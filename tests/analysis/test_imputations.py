@@ -67,3 +67,14 @@ def test_a_code_that_moves_the_joints_is_found(loaded, study, training, monkeypa
     led_astray = imputation_figures(study, training, signals)
     assert faithful["prior"]["body_keypoints_mm"] < 0.5 < led_astray["prior"]["body_keypoints_mm"]
     assert led_astray["zero"]["body_keypoints_mm"] == pytest.approx(faithful["zero"]["body_keypoints_mm"], abs=1e-4)
+
+
+def test_where_the_true_surface_is_known_clothes_are_measured_against_it(loaded, study, training):
+    signals = drive_of_capture(loaded.run, loaded.avatar, loaded.capture.path, training).signals
+    exact = loaded.avatar.pose_template(signals.theta, signals.root).detach().numpy()
+    exact[:, study.garment] += np.array([0.0, 0.0, 2e-3], np.float32)
+    exact[:, 0] += 1.0  # no clothes
+    figures = imputation_figures(study, training, signals, exact=exact)
+    assert figures["zero"]["from_truth_mm"] == pytest.approx(2, rel=1e-3)
+    assert figures["prior"]["from_truth_mm"] > 2
+    assert imputation_figures(study, training, signals)["zero"]["from_truth_mm"] is None
