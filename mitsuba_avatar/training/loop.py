@@ -190,7 +190,7 @@ class Trainer:
         """Write a checkpoint; see `Checkpoints.save`."""
         state = {"optimizer": self.optimizer.state_dict(), "guard": self.guard.state_dict()}
         if self.information is not None:
-            state["information"] = self.information.state_dict()
+            state["mutual_information"] = self.information.state_dict()
         if self.response is not None:
             state["camera_response"] = self.response.saved()
         checkpoints.save(self.avatar.state_dict(), state, self.iteration, psnr)
@@ -208,8 +208,8 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         if "guard" in state:
             self.guard.load_state_dict(state["guard"])
-        if self.information is not None and "information" in state:
-            self.information.load_state_dict(state["information"])
+        if self.information is not None and "mutual_information" in state:
+            self.information.load_state_dict(state["mutual_information"])
         if self.response is not None and "camera_response" in state:
             self.response.restore(state["camera_response"])
 
