@@ -47,11 +47,11 @@ def test_an_entry_has_no_influence_outside_its_mask():
         assert torch.equal(changed, masks[entry] > 0)
 
 
-def test_without_compression_the_masked_signal_itself_comes_out():
+def test_without_compression_the_masked_signal_itself_comes_out_in_units_of_the_root_of_its_entries():
     masks, signal = make_masks(), torch.randn(2, 3)
     layer = LocalizedSignal(masks, channels=None)
     assert layer.channels == 3
-    assert torch.equal(layer(signal), masks * signal[:, :, None, None])
+    torch.testing.assert_close(layer(signal), masks * signal[:, :, None, None] / 3**0.5)
     assert not list(layer.parameters())
 
 
