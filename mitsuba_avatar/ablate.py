@@ -50,8 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
         runs = plan_runs(folder, rows, command.seeds, command.budget, capture, [*(REHEARSAL if command.rehearsal else ()), *overrides])
         iterations = sum(run.settings.training.iterations for run in runs)
         with progress_bar("ablation", iterations, sum(run.iterations_done() for run in runs)) as bar:
-            run_workers(runs, command.jobs or default_jobs(), bar.update)
-        sys.stdout.write(markdown(write_tables(folder, runs)))
+            try:
+                run_workers(runs, command.jobs or default_jobs(), bar.update)
+            finally:  # what is measured is tabled, whatever happened to the rest
+                entries = write_tables(folder, runs)
+        sys.stdout.write(markdown(entries))
         sys.stderr.write(f"Tables are in {folder}\n")
         return 0
     except (ValueError, OSError, RuntimeError, backend.BackendError) as error:

@@ -2,7 +2,7 @@
 
 Two workers with one thread each do more in the same time than one worker with two: small maps leave a second thread idle. A worker
 writes to worker.log in its run folder. Ctrl-C reaches the workers too (they belong to the same terminal); each saves a checkpoint, and
-the same command goes on from there.
+the same command goes on from there. A worker that fails does not stop the others: a night is not lost because one row diverged.
 """
 
 import os
@@ -22,7 +22,7 @@ LOG = "worker.log"
 
 
 def run_workers(planned: list[PlannedRun], jobs: int, progress: Callable[[int, int], None]) -> None:
-    """Finish every run that is not measured yet.
+    """Finish every run that is not measured yet, as far as they can be finished.
 
     Args:
         planned: in the order in which they are started.
@@ -30,13 +30,14 @@ def run_workers(planned: list[PlannedRun], jobs: int, progress: Callable[[int, i
         progress: called as progress(iterations done, iterations in all).
 
     Raises:
-        RuntimeError: a worker failed; the others are interrupted and have saved their checkpoints. The message ends with its log.
+        RuntimeError: workers failed; all other runs are finished. The message names them and ends with the log of the first.
         KeyboardInterrupt: Ctrl-C or SIGTERM; after all workers have saved.
     """
     previous = signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended from outside, workers must not go on unseen
     waiting = [run for run in planned if not run.is_measured]
     total = sum(run.settings.training.iterations for run in planned)
     workers: dict[subprocess.Popen, PlannedRun] = {}
+    failures: list[tuple[PlannedRun, int]] = []
     try:
         while waiting or workers:
             while waiting and len(workers) < jobs:
@@ -46,8 +47,10 @@ def run_workers(planned: list[PlannedRun], jobs: int, progress: Callable[[int, i
             for worker in [worker for worker in workers if worker.poll() is not None]:
                 run = workers.pop(worker)
                 if worker.returncode != 0:
-                    raise RuntimeError(_failure(run, worker.returncode))
+                    failures.append((run, worker.returncode))
             progress(sum(run.iterations_done() for run in planned), total)
+        if failures:
+            raise RuntimeError(_told(failures))
     finally:
         _stop(list(workers))
         signal.signal(signal.SIGTERM, previous)
@@ -76,7 +79,9 @@ def _stop(workers: list[subprocess.Popen]) -> None:
         worker.wait()
 
 
-def _failure(run: PlannedRun, status: int) -> str:
-    log: Path = run.path / LOG
+def _told(failures: list[tuple[PlannedRun, int]]) -> str:
+    """Which runs failed, and how the first one's log ends."""
+    named = ", ".join(f"{run.path} ended with status {status}" for run, status in failures)
+    log: Path = failures[0][0].path / LOG
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL:]
-    return f"run_workers(): {run.path} ended with status {status}; {log} ends:\n" + "\n".join(f"    {line}" for line in lines)
+    return f"run_workers(): {named}; all other runs are finished. {log} ends:\n" + "\n".join(f"    {line}" for line in lines)
