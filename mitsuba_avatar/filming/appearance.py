@@ -18,16 +18,23 @@ from mitsuba_avatar.filming.canvas import Canvas, Map, Paint, Surface
 from mitsuba_avatar.filming.clothing import DressedBody, hairline
 from mitsuba_avatar.filming.fabric import strands
 from mitsuba_avatar.filming.leafy_prints import FAIR_HAIR, paint_leafy_shirt, paint_light_trousers
-from mitsuba_avatar.filming.prints import DARK_HAIR, paint_shirt, paint_trousers
+from mitsuba_avatar.filming.prints import DARK_HAIR, paint_plain_shirt, paint_shirt, paint_trousers
 from mitsuba_avatar.filming.skin import paint_skin
 
 SPECULAR = 0.35  # of skin
-# The two attires of the paper's unmatched setting: garment -> painter. "striped" is what captures are filmed in.
+# Garment -> painter. "striped" is what captures are filmed in, "plain" the same person's shirt without stripes, "leafy" the other attire of
+# the paper's unmatched setting.
 ATTIRES: dict[str, dict[str, Callable[[Canvas], Paint]]] = {
     "striped": {
         "trousers": paint_trousers,
         "shorts": paint_trousers,
         "shirt": paint_shirt,
+        "hair": partial(strands, colour=DARK_HAIR),
+    },
+    "plain": {
+        "trousers": paint_trousers,
+        "shorts": paint_trousers,
+        "shirt": paint_plain_shirt,
         "hair": partial(strands, colour=DARK_HAIR),
     },
     "leafy": {

@@ -1,4 +1,4 @@
-"""How the first attire is painted, in which captures are filmed.
+"""How the attires are painted in which captures are filmed: striped, and the same without stripes.
 
 Prints are asymmetric on purpose: a mirrored or shifted reconstruction must show.
 
@@ -24,17 +24,21 @@ PATCH = (0.41, 0.098, 0.041)
 def paint_shirt(canvas: Canvas) -> Paint:
     """Light cloth: stripes below the chest and on the right sleeve, a dark left sleeve, an emblem on the left chest, a print behind."""
     anatomy, points = canvas.anatomy, canvas.points
-    base, top = anatomy.joint("spine05")[2], anatomy.joint("neck01")[2]
-    height = (points[..., 2] - base) / (top - base)
+    height = _height_on_shirt(canvas)
     sleeve = {side: on_sleeve(canvas, side) for side in SIDES}
-    torso = 1 - np.maximum(sleeve["L"], sleeve["R"])
-    paint = dyed(weave(canvas, (0.05, 0.006), (0.03, 0.05)), SHIRT, 0.78)
-    paint = paint.over(STRIPES, bands(height, period=0.16, fill=0.42) * smooth_step(height, 0.66, 0.645) * torso)
+    paint = _light_cloth(canvas)
+    paint = paint.over(STRIPES, bands(height, period=0.16, fill=0.42) * smooth_step(height, 0.66, 0.645) * _torso(canvas))
     start, direction, length = anatomy.axis("upperarm01.R", "lowerarm01.R")
     paint = paint.over(STRIPES, bands((points - start) @ direction / length, period=0.25, fill=0.4) * sleeve["R"])
-    paint = paint.over(STRIPES, sleeve["L"])
-    paint = paint.over(EMBLEM, _emblem(points, 0.075, base + 0.80 * (top - base)) * (points[..., 1] < 0.0) * torso)
-    return paint.over(EMBLEM, _back_print(points, -0.035, base + 0.76 * (top - base)) * (points[..., 1] > 0.03) * torso)
+    return _printed(canvas, paint.over(STRIPES, sleeve["L"]))
+
+
+def paint_plain_shirt(canvas: Canvas) -> Paint:
+    """Light cloth with the emblem on the left chest and the print behind, and nothing else.
+
+    An image error then tells of shading as much as of shape; where stripes are, one that is a pixel off costs more than any shadow.
+    """
+    return _printed(canvas, _light_cloth(canvas))
 
 
 def paint_trousers(canvas: Canvas) -> Paint:
@@ -53,6 +57,28 @@ def paint_trousers(canvas: Canvas) -> Paint:
             height = np.abs(points[..., 2] - knee[2] + 0.01)
             paint = paint.over(PATCH, within(height, 0.060, EDGE) * within(np.abs(angle), 0.72, 0.06) * leg)
     return paint
+
+
+def _light_cloth(canvas: Canvas) -> Paint:
+    return dyed(weave(canvas, (0.05, 0.006), (0.03, 0.05)), SHIRT, 0.78)
+
+
+def _height_on_shirt(canvas: Canvas) -> Map:
+    base, top = (canvas.anatomy.joint(name)[2] for name in ("spine05", "neck01"))
+    return (canvas.points[..., 2] - base) / (top - base)
+
+
+def _torso(canvas: Canvas) -> Map:
+    """1 on the shirt's trunk, 0 on its sleeves."""
+    return 1 - np.maximum(on_sleeve(canvas, "L"), on_sleeve(canvas, "R"))
+
+
+def _printed(canvas: Canvas, paint: Paint) -> Paint:
+    """A shirt with the emblem on the left chest and the print behind."""
+    points, torso = canvas.points, _torso(canvas)
+    base, top = (canvas.anatomy.joint(name)[2] for name in ("spine05", "neck01"))
+    paint = paint.over(EMBLEM, _emblem(points, 0.075, base + 0.80 * (top - base)) * (points[..., 1] < 0.0) * torso)
+    return paint.over(EMBLEM, _back_print(points, -0.035, base + 0.76 * (top - base)) * (points[..., 1] > 0.03) * torso)
 
 
 def _emblem(points: np.ndarray, x: float, z: float) -> Map:

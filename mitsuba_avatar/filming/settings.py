@@ -45,7 +45,7 @@ class ClothingSettings:
 
     texture_size: int = 512  # texels along a side of what the person is painted with
     outfit: Literal["shirt", "loose_shirt", "shorts"] = "shirt"  # whose first word is simulated; see filming/wardrobe.py
-    attire: Literal["striped", "leafy"] = "striped"  # colours and prints of clothes, colour of hair
+    attire: Literal["striped", "plain", "leafy"] = "striped"  # colours and prints of clothes, colour of hair
     has_details: bool = False  # eyes and teeth with paint of their own: a third more time, seen from about 400 pixels of height
     headset: bool = False  # a virtual-reality headset hides the upper face
     is_simulated: bool = True  # False: cloth is displaced by pose and a little lag, without simulation

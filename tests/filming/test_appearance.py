@@ -6,6 +6,7 @@ from mitsuba_avatar.filming.anatomy import Anatomy
 from mitsuba_avatar.filming.appearance import ATTIRES, Appearance, paint, paint_garment
 from mitsuba_avatar.filming.canvas import Canvas, Paint, Surface, bands, within
 from mitsuba_avatar.filming.clothing import DressedBody
+from mitsuba_avatar.filming.prints import EMBLEM, SHIRT, STRIPES
 
 SIZE = 128
 
@@ -58,7 +59,7 @@ def test_bands_and_edges():
 
 
 def test_attires_differ_in_clothes_and_hair_and_agree_in_skin(anatomy: Anatomy, body: DressedBody):
-    first, second = (paint(anatomy, body, SIZE, 0, attire) for attire in ATTIRES)
+    first, second = (paint(anatomy, body, SIZE, 0, attire) for attire in ("striped", "leafy"))
     places = {
         "chest": anatomy.joint("spine01") + [-0.05, -0.12, 0],
         "knee": anatomy.joint("lowerleg01.L") + [0, 0.1, 0],
@@ -69,8 +70,17 @@ def test_attires_differ_in_clothes_and_hair_and_agree_in_skin(anatomy: Anatomy, 
         name: np.abs(_colour_at(anatomy, first, place) - _colour_at(anatomy, second, place)).max() for name, place in places.items()
     }
     assert min(difference[name] for name in ("chest", "knee", "hair")) > 0.08 and difference["hand"] == 0
-    with pytest.raises(ValueError, match=r"paint\(\): expected an attire of striped, leafy; got 'plain'"):
-        paint(anatomy, body, SIZE, 0, "plain")
+    with pytest.raises(ValueError, match=r"paint\(\): expected an attire of striped, plain, leafy; got 'checked'"):
+        paint(anatomy, body, SIZE, 0, "checked")
+
+
+def test_the_plain_shirt_is_the_striped_one_without_stripes(anatomy: Anatomy, body: DressedBody):
+    striped, plain = (paint(anatomy, body, SIZE, 0, attire).base_colour for attire in ("striped", "plain"))
+    differs = np.abs(striped - plain).max(axis=-1) > 1e-3
+    stripes = np.abs(striped - STRIPES).max(axis=-1) < 0.06
+    assert 0.01 < differs.mean() < 0.5 and stripes[differs].mean() > 0.7, "what differs is stripes"
+    emblem = (np.abs(plain - EMBLEM).max(axis=-1) < 0.05) & ~differs
+    assert emblem.any() and np.abs(plain[differs] - SHIRT).mean() < 0.05
 
 
 def test_a_garment_with_a_mesh_of_its_own_is_cloth_all_over(anatomy: Anatomy, body: DressedBody):
