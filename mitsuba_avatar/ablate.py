@@ -26,7 +26,7 @@ from mitsuba_avatar.settings import Settings
 class AblateCommand:
     """Train every row of the ablation table, measure it, write the table."""
 
-    capture: str = ""  # capture folder, or FORMAT:DIR; default: the studio's preset study, filmed on first use (about 20 minutes)
+    capture: str = ""  # capture folder, or FORMAT:DIR; default: the studio's preset study, filmed on first use (20 to 50 minutes)
     out: str = ""  # where runs and tables go; default: runs/ablation, runs/rehearsal
     rows: str = ""  # comma-separated; default: all of configs/ablation/
     seeds: int = 1  # how many of each row
