@@ -27,10 +27,11 @@ def test_report_and_pictures_are_written(fitted_run: Path, tmp_path: Path, capsy
 def test_with_another_capture_the_own_one_is_driven_with_every_imputation_too(
     fitted_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ):
-    own = str(LoadedRun.open(fitted_run).capture.path)
+    run = shutil.copytree(fitted_run, tmp_path / "run")  # codes of its training frames are kept in it
+    own = str(LoadedRun.open(run).capture.path)
     other = tmp_path / "other"
     shutil.copytree(own, other)
-    assert main([str(fitted_run), "--out", str(tmp_path / "analysis"), "--frames", "1", "--drives", str(other)]) == 0
+    assert main([str(run), "--out", str(tmp_path / "analysis"), "--frames", "1", "--drives", str(other)]) == 0
     figures = json.loads(capsys.readouterr().out)["imputation"]
     assert list(figures) == [own, str(other)]
     assert figures[own]["nearest"]["from_truth_mm"] > 0 and figures[str(other)]["nearest"]["from_truth_mm"] is None
