@@ -150,7 +150,7 @@ class DisentanglementSettings:
     """The estimator of mutual information between latent code and driving signal; its weight is `loss.mutual_information`."""
 
     statistics_channels: int = 128  # hidden features of the statistics network
-    memory: int = 512  # recent pairs of latent code and driving signal that it learns from; old ones show an encoder that is gone
+    memory: int = 512  # recent posteriors, with their driving signals, that it learns from; old ones show an encoder that is gone
     pairs: int = 128  # drawn from the memory for each update, and remembered driving signals that a batch is compared with
     updates: int = 2  # of the statistics network, a step of the avatar
     statistics_learning_rate: float = 1e-3  # of its own optimizer

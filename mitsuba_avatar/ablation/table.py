@@ -46,7 +46,6 @@ class Entry:
     """
 
     row: Row
-    seeds: int
     errors: dict[str, Spread]
     excesses: tuple[float, ...]  # per cent that the test error is above that of ours with the same seed; none for ours itself
     latent: tuple[Spread | None, ...]  # LATENT_FIGURES
@@ -75,7 +74,6 @@ def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
         entries.append(
             Entry(
                 row,
-                len(measured),
                 {split: Spread.of([one[split] for one in errors]) for split in errors[0]},
                 tuple(100 * (test / reference - 1) for test, reference in pairs) if row.name != REFERENCE else (),
                 tuple(_spread(parts, name) for name in LATENT_FIGURES),

@@ -24,7 +24,8 @@ PATCH = (0.41, 0.098, 0.041)
 def paint_shirt(canvas: Canvas) -> Paint:
     """Light cloth: stripes below the chest and on the right sleeve, a dark left sleeve, an emblem on the left chest, a print behind."""
     anatomy, points = canvas.anatomy, canvas.points
-    height = _height_on_shirt(canvas)
+    base, top = _span(canvas)
+    height = (points[..., 2] - base) / (top - base)
     sleeve = {side: on_sleeve(canvas, side) for side in SIDES}
     paint = _light_cloth(canvas)
     paint = paint.over(STRIPES, bands(height, period=0.16, fill=0.42) * smooth_step(height, 0.66, 0.645) * _torso(canvas))
@@ -36,7 +37,7 @@ def paint_shirt(canvas: Canvas) -> Paint:
 def paint_plain_shirt(canvas: Canvas) -> Paint:
     """Light cloth with the emblem on the left chest and the print behind, and nothing else.
 
-    An image error then tells of shading as much as of shape; where stripes are, one that is a pixel off costs more than any shadow.
+    For captures whose image error is to tell of shading: a stripe that is a pixel off adds to it as a shadow does.
     """
     return _printed(canvas, _light_cloth(canvas))
 
@@ -63,9 +64,10 @@ def _light_cloth(canvas: Canvas) -> Paint:
     return dyed(weave(canvas, (0.05, 0.006), (0.03, 0.05)), SHIRT, 0.78)
 
 
-def _height_on_shirt(canvas: Canvas) -> Map:
-    base, top = (canvas.anatomy.joint(name)[2] for name in ("spine05", "neck01"))
-    return (canvas.points[..., 2] - base) / (top - base)
+def _span(canvas: Canvas) -> tuple[float, float]:
+    """Height of the pelvis and of the base of the neck, metres."""
+    base, top = (float(canvas.anatomy.joint(name)[2]) for name in ("spine05", "neck01"))
+    return base, top
 
 
 def _torso(canvas: Canvas) -> Map:
@@ -76,7 +78,7 @@ def _torso(canvas: Canvas) -> Map:
 def _printed(canvas: Canvas, paint: Paint) -> Paint:
     """A shirt with the emblem on the left chest and the print behind."""
     points, torso = canvas.points, _torso(canvas)
-    base, top = (canvas.anatomy.joint(name)[2] for name in ("spine05", "neck01"))
+    base, top = _span(canvas)
     paint = paint.over(EMBLEM, _emblem(points, 0.075, base + 0.80 * (top - base)) * (points[..., 1] < 0.0) * torso)
     return paint.over(EMBLEM, _back_print(points, -0.035, base + 0.76 * (top - base)) * (points[..., 1] > 0.03) * torso)
 

@@ -147,21 +147,21 @@ def test_codes_of_pure_noise_are_left_alone():
 
 
 def test_a_frame_met_again_is_judged_by_its_posterior_not_by_the_draw_that_was_seen():
-    """A narrow leak through a wide, noisy code: a network that saw one draw of each frame would know the draws and miss the leak."""
+    """A narrow leak through a wide, noisy code: a network that learns from the draws of each meeting knows them and misses half of it."""
     generator = torch.Generator().manual_seed(0)
     frames = torch.randn((80, 4), generator=generator)
     posteriors = Posterior(torch.cat([1.5 * frames, torch.zeros(80, 60)], dim=1), torch.zeros(80, 64))
     again, once = (MutualInformation(64, 4, DisentanglementSettings()) for _ in range(2))
-    fixed = drawn(posteriors, generator)
     for step in range(150):
         rows = torch.arange(4 * step, 4 * step + 4) % 80
-        again.observe(Posterior(posteriors.mu[rows], posteriors.logvar[rows]), frames[rows])
-        once.observe(exact(fixed[rows]), frames[rows])
+        posterior = Posterior(posteriors.mu[rows], posteriors.logvar[rows])
+        again.observe(posterior, frames[rows])
+        once.observe(exact(drawn(posterior, generator)), frames[rows])
     true = 2 * math.log(1 + 1.5**2)
     z = drawn(posteriors, generator)
     with torch.no_grad():
         found, missed = (mutual_information_bound(one.network(z, frames), one.network(z[:, None], frames[None])) for one in (again, once))
-    assert float(found) > 0.5 * true and float(missed) < 0.5 * float(found)
+    assert float(found) > 0.7 * true and float(missed) < 0.6 * true
 
 
 def test_the_gradient_reaches_the_codes_and_nothing_else():
