@@ -21,6 +21,7 @@ from types import ModuleType
 MINIMUM_LLVM = 17
 LLVM_VARIANT = "llvm_ad_rgb"
 CUDA_VARIANT = "cuda_ad_rgb"
+FEWEST_THREADS = 2  # of Dr.Jit's pool: with one, on a machine of one core, Mitsuba waits for ever while it reads an image file
 
 LLVM_INSTALLATION = {
     "apt": "apt-get install -y libllvm19",
@@ -149,6 +150,9 @@ def select_variant(variant: str = "auto") -> str:
         raise BackendError(f"select_variant(): {CUDA_VARIANT} needs {missing}; none answers. Use --variant {LLVM_VARIANT}.")
     mitsuba = importlib.import_module("mitsuba")
     mitsuba.set_variant(variant)
+    drjit = importlib.import_module("drjit")
+    if drjit.thread_count() < FEWEST_THREADS:
+        drjit.set_thread_count(FEWEST_THREADS)
     global _selected
     _selected = variant
     return variant

@@ -1,5 +1,6 @@
 """Finding libLLVM by version, refusing an old one, and the variant of each thread."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -123,3 +124,16 @@ def test_a_process_that_selected_nothing_is_told():
     code = "from mitsuba_avatar.rendering.backend import loaded_mitsuba; loaded_mitsuba()"
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
     assert "no variant is selected yet. Call backend.select_variant() first" in done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not bind processes to cores")
+def test_one_core_is_enough_to_read_a_scene_with_an_image():
+    program = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "from mitsuba_avatar.rendering import backend; backend.select_variant('llvm_ad_rgb')\n"
+        "import mitsuba as mi; from mitsuba_avatar.resources import find_resource\n"
+        "file = find_resource('scenes', 'dome', '.xml').with_name('dome.exr')\n"
+        "print(mi.load_dict({'type': 'envmap', 'filename': str(file)}).class_name())\n"
+    )
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert finished.returncode == 0 and "EnvironmentMap" in finished.stdout, finished.stderr
