@@ -1,7 +1,7 @@
 """What each kind of take does with the pose angles, as curves over time: range of motion, gestures, held poses, recombined limbs.
 
 All curves are sums of a few sines, so that they are smooth at any frame rate and the same for one seed. Angles stay in ranges within which
-limbs keep clear of the trunk and each other.
+limbs keep clear of the trunk and each other; reaching brings forearm and hand to a few centimetres from the trunk.
 
 Symbols: N frames, D pose angles. Radians, seconds; angles are offsets from the rig's rest pose.
 """
@@ -31,6 +31,23 @@ SAFE = {
 # How people stand while nothing else moves: arms lower than at rest, elbows relaxed.
 STANCE = {"shoulder_abduction": -0.26, "elbow_flexion": -0.22, "shoulder_flexion": -0.03}
 TALKING = {"shoulder_abduction": -0.2, "shoulder_flexion": 0.32, "shoulder_inward_rotation": 0.12, "elbow_flexion": 0.5}
+# An arm in front of the trunk, on its own side, 3 to 5 centimetres off the skin: hand before the hip, and before the chest.
+REACH_LOW = {
+    "shoulder_flexion": -0.41,
+    "shoulder_abduction": -0.15,
+    "shoulder_inward_rotation": 0.80,
+    "elbow_flexion": 0.80,
+    "forearm_pronation": -0.45,
+    "clavicle_protraction": 0.15,
+}
+REACH_HIGH = {
+    "shoulder_flexion": -0.05,
+    "shoulder_abduction": 0.0,
+    "shoulder_inward_rotation": 0.60,
+    "elbow_flexion": 1.49,
+    "forearm_pronation": -0.55,
+    "clavicle_protraction": 0.0,
+}
 SWING = {
     "trunk": 0.45,
     "neck": 0.5,
@@ -137,6 +154,13 @@ def limb_offsets(rig: Rig, group: str, time: np.ndarray, seed: int) -> Float[np.
             for name, share in (("hip_flexion", 0.75), ("knee_flexion", 1.1), ("ankle_dorsiflexion", 0.3)):
                 offsets[:, rig.dofs.names.index(f"{side}_{name}")] = share * depth
         return offsets
+    if group.endswith("_reach"):
+        depth, height = (0.5 + 0.5 * _full(waves(time, share * SLOW, rng)) for share in (0.6, 0.4))
+        depth = np.sin(0.5 * np.pi * depth)  # longer near the trunk than on the way
+        for part, low in REACH_LOW.items():
+            index = rig.dofs.names.index(group.replace("reach", part))
+            offsets[:, index] = depth * (low + height * (REACH_HIGH[part] - low) - stance[index])
+        return offsets
     shared = {part: waves(time, SLOW, rng) for part in ("flexion", "bend", "turn")}
     for index, name in _members(rig, group):
         lower, upper = _safe_range(rig, index, name)
@@ -160,12 +184,6 @@ def move_fingers(rig: Rig, theta: Float[np.ndarray, "N D"], time: np.ndarray, rn
             lower, upper = _safe_range(rig, index, name)
             theta[:, index] = 0.5 * (lower + upper) + 0.5 * (upper - lower) * waves(time, 2.0, rng)
     return _curl_together(rig, theta, time, rng)
-
-
-def within_reach(rig: Rig, theta: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
-    """Angles within their safe ranges."""
-    lower, upper = np.array([_safe_range(rig, index, name) for index, name in enumerate(rig.dofs.names)]).T
-    return np.clip(theta, lower, upper)
 
 
 def stance(rig: Rig) -> Float[np.ndarray, "D"]:  # noqa: F821

@@ -1,7 +1,7 @@
 """What the person does: joint angles, place in the room and facial actions of every frame, with training and test takes that differ.
 
 The takes come from a script (`filming.takes`), their curves from `filming.choreography`, or all of it from recordings: BVH for the body,
-Live Link Face for the face. Test takes of the study are brought to a set distance from the nearest training pose.
+Live Link Face for the face. Test takes of the study are brought to a set distance at most from the nearest training pose.
 
 Symbols: N frames, D pose angles, A facial actions. Radians, metres, seconds; angles are offsets from the rig's rest pose.
 """
@@ -28,7 +28,7 @@ from mitsuba_avatar.recordings.live_link import read_live_link
 from mitsuba_avatar.recordings.retargeting import retarget
 
 FOOT_LIFT = 0.05  # metres that a foot must leave the floor before it clearly no longer carries the person
-DISTANCE = np.radians(45.0)  # of the study's test poses from the nearest training pose, in the middle of a take; see `pose_distances`
+DISTANCE = np.radians(45.0)  # most that the study's test poses are from the nearest training pose, median of a take; see `pose_distances`
 MOST_TRAINING, MOST_TEST = 10_000, 500  # poses that this distance is measured between; more change it by less than a degree
 AT_ONCE = 1024  # frames
 STILL = ("range", "slow", "held")  # styles in which the person hardly turns
@@ -194,16 +194,18 @@ def _training_poses(planned: Sequence[PlannedTake], theta: Sequence[np.ndarray])
 
 
 def _at_distance(rig: Rig, theta: Float[np.ndarray, "N D"], train: Float[np.ndarray, "T D"]) -> Float[np.ndarray, "N D"]:
-    """The poses, larger or smaller as seen from the stance, so that half of them are `DISTANCE` or more from every training pose."""
+    """The poses, drawn towards the stance until no more than half of them are `DISTANCE` or more from every training pose.
+
+    Never made larger: reaching arms would enter the trunk.
+    """
     body, stance = body_angles(rig), choreography.stance(rig)
     tree = cKDTree(_spread(train, MOST_TRAINING)[:, body])
     judged = _spread(theta, MOST_TEST)
 
     def scaled(theta: Float[np.ndarray, "N D"], scale: float) -> Float[np.ndarray, "N D"]:
-        changed = np.where(body, stance + scale * (theta - stance), theta)
-        return np.where(body, choreography.within_reach(rig, changed), changed)
+        return np.where(body, stance + scale * (theta - stance), theta)
 
-    smallest, largest = 0.1, 3.0
+    smallest, largest = 0.1, 1.0
     for _ in range(20):
         middle = 0.5 * (smallest + largest)
         if np.median(tree.query(scaled(judged, middle)[:, body])[0]) < DISTANCE:

@@ -1,8 +1,9 @@
 """Scripts: which takes a person performs, how many frames each has, and which of them are for training, validation and testing.
 
 `default` is short and moves everything. `study` is made for finding out what the pose does not tell: each limb moves slowly on its own,
-face and fingers move while the body holds still (so that training frames link expressions and poses that have nothing to do with each
-other), blocks of training takes are held out for validation, and test takes put limb movements together that training never showed at once.
+arms reach in front of the trunk and shade it, face and fingers move while the body holds still (so that training frames link expressions
+and poses that have nothing to do with each other), blocks of training takes are held out for validation, and test takes put limb movements
+together that training never showed at once.
 """
 
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ class Take:
 
     Attributes:
         groups: of pose angles that move; range of motion visits them one after the other, other takes move all of them at once.
-        style: "range" (one group at a time), "conversation" or "recombined" (all at once, wide), "slow" (one limb, slowly), "held" (the
-            body holds poses, fingers move), "recomposed" (limbs as in the slow takes, at once, at a set distance from training),
+        style: "range" (one group at a time), "conversation" or "recombined" (all at once, wide), "slow" (one limb or a few, slowly), "held"
+            (the body holds poses, fingers move), "recomposed" (limbs as in the slow takes, at once, at most a set distance from training),
             "gestures" (conversation at that distance), "wild" (fast and wide).
         face: what the face does.
         share: of the split's frames.
@@ -47,20 +48,24 @@ DEFAULT = (
     Take("test_conversation", "test", "conversation", ("arms", "trunk", "neck", "hands"), 0.4, "conversation"),
 )
 STUDY = (
-    Take("slow_trunk", "train", "slow", ("trunk",), 0.12),
-    Take("slow_head", "train", "slow", ("neck",), 0.08),
-    Take("slow_left_arm", "train", "slow", ("left_arm",), 0.14),
-    Take("slow_right_arm", "train", "slow", ("right_arm",), 0.14),
-    Take("slow_left_leg", "train", "slow", ("left_leg",), 0.08),
-    Take("slow_right_leg", "train", "slow", ("right_leg",), 0.08),
-    Take("slow_knee_bends", "train", "slow", ("knee_bends",), 0.06),
-    Take("slow_hands", "train", "slow", ("hands",), 0.06),
-    Take("held_expressions", "train", "held", ("trunk", "left_arm", "right_arm"), 0.12, "expressions"),
-    Take("held_speech", "train", "held", ("trunk", "left_arm", "right_arm"), 0.12, "conversation"),
-    Take("test_arms", "test", "recomposed", ("left_arm", "right_arm"), 0.25, "expressions"),
-    Take("test_arms_and_trunk", "test", "recomposed", ("left_arm", "right_arm", "trunk", "neck"), 0.25, "conversation"),
-    Take("test_whole_body", "test", "recomposed", ("left_arm", "right_arm", "trunk", "neck", "knee_bends"), 0.25, "expressions"),
-    Take("test_conversation", "test", "gestures", ("arms", "trunk", "neck", "hands"), 0.25, "conversation"),
+    Take("slow_trunk", "train", "slow", ("trunk",), 0.10),
+    Take("slow_head", "train", "slow", ("neck",), 0.05),
+    Take("slow_left_arm", "train", "slow", ("left_arm",), 0.10),
+    Take("slow_right_arm", "train", "slow", ("right_arm",), 0.10),
+    Take("slow_left_reach", "train", "slow", ("left_reach",), 0.10),
+    Take("slow_right_reach", "train", "slow", ("right_reach",), 0.10),
+    Take("slow_reaches", "train", "slow", ("left_reach", "right_reach"), 0.08),
+    Take("slow_left_leg", "train", "slow", ("left_leg",), 0.06),
+    Take("slow_right_leg", "train", "slow", ("right_leg",), 0.06),
+    Take("slow_knee_bends", "train", "slow", ("knee_bends",), 0.04),
+    Take("slow_hands", "train", "slow", ("hands",), 0.04),
+    Take("held_expressions", "train", "held", ("trunk", "left_arm", "right_reach"), 0.08, "expressions"),
+    Take("held_speech", "train", "held", ("trunk", "left_reach", "right_arm"), 0.08, "conversation"),
+    Take("test_arms", "test", "recomposed", ("left_arm", "right_arm"), 0.15, "expressions"),
+    Take("test_reaches", "test", "recomposed", ("left_reach", "right_reach", "neck"), 0.25, "conversation"),
+    Take("test_reaches_and_trunk", "test", "recomposed", ("left_reach", "right_reach", "trunk", "neck"), 0.25, "expressions"),
+    Take("test_whole_body", "test", "recomposed", ("left_arm", "right_reach", "neck", "knee_bends"), 0.15, "expressions"),
+    Take("test_conversation", "test", "gestures", ("arms", "trunk", "neck", "hands"), 0.20, "conversation"),
 )
 STRESS = Take("stress_wild", "test", "wild", ("left_arm", "right_arm", "trunk", "neck", "legs"), 1.0, "expressions")
 

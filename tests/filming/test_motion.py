@@ -4,9 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
+from scipy.spatial import cKDTree
 
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.body.skeleton import Skeleton
+from mitsuba_avatar.body.skinning import posed_rest_surface
+from mitsuba_avatar.filming.anatomy import Anatomy
 from mitsuba_avatar.filming.motion import Motion, body_angles, perform, pose_distances
 from mitsuba_avatar.filming.settings import MotionSettings, StudioSettings
 from tests.filming.acted import Acted
@@ -151,8 +155,8 @@ def test_study_tests_are_thirty_to_sixty_degrees_from_training_and_stress_is_far
     assert len(tests) >= 3
     for name in tests:
         far = distance[frames_in(study, name)]
-        assert 40 < np.median(far) < 50, name
-        assert ((far > 25) & (far < 65)).mean() > 0.85, name
+        assert (25 if "reaches" in name else 40) < np.median(far) < 50, name  # reaching arms are not moved farther: into the trunk
+        assert ((far > 15) & (far < 65)).mean() > 0.85, name
     assert np.median(distance[frames_in(study, "stress")]) > 80
     validation = np.array([frame.split == "validation" for frame in study.frames])
     assert np.median(distance[validation]) < 20
@@ -180,6 +184,26 @@ def test_arms_of_the_study_are_off_the_torso(rig: Rig, study: Motion):
         arm = at[f"lowerarm01.{side}"] - at[f"upperarm01.{side}"]
         cosine = (arm * down).sum(axis=1) / np.linalg.norm(arm, axis=1) / np.linalg.norm(down, axis=1)
         assert np.degrees(np.arccos(cosine))[calm].min() > 18
+
+
+def test_reaching_brings_forearm_and_hand_close_to_the_trunk_and_not_into_it(rig: Rig, study: Motion):
+    anatomy = Anatomy.of(rig)
+    reaching = np.flatnonzero(frames_in(study, "slow_left_reach") | frames_in(study, "test_reaches"))[::2]
+    arm = anatomy.weight(("upperarm", "lowerarm", "wrist", "metacarpal", "finger", "clavicle", "shoulder"))
+    trunk = np.flatnonzero((arm < 0.05) & (anatomy.weight(("head",)) < 0.3) & (anatomy.piece == 0))
+    forearm = np.flatnonzero(anatomy.weight(("lowerarm", "wrist", "metacarpal", "finger"), "L") > 0.95)[::5]
+    place = np.full(rig.topology.num_vertices, -1)
+    place[trunk] = np.arange(len(trunk))
+    faces = place[rig.topology.faces[np.isin(rig.topology.faces, trunk).all(axis=1)]]
+    nearest = []
+    for frame in reaching:
+        posed = posed_rest_surface(rig, study.theta[frame], np.eye(4))
+        surface = trimesh.Trimesh(posed[trunk], faces, process=False)
+        distance, index = cKDTree(posed[trunk]).query(posed[forearm])
+        outwards = ((posed[forearm] - posed[trunk][index]) * surface.vertex_normals[index]).sum(axis=1)
+        nearest.append(np.where(outwards < 0, -distance, distance).min())
+    assert min(nearest) > 0.005  # metres
+    assert (np.array(nearest) < 0.08).mean() > 0.1
 
 
 def test_recordings_are_played_with_training_validation_and_test_parts(rig: Rig, tmp_path: Path):
