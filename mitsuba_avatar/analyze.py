@@ -1,8 +1,9 @@
 """What an avatar has learnt: `python -m mitsuba_avatar.analyze RUN [--capture DIR] [--drives DIR ...] [--out DIR]`.
 
 Prints, and writes to report.json: how much the latent code says and what it tells about the driving signal, what swaps of codes and of
-driving signals move, chance correlations, distances from the true surface. Draws where controls act, where the avatar is unsure, and what
-inverse rendering gained. Captures given with --drives move the avatar, as its own test frames do, with every imputation of its latent code.
+driving signals move, chance correlations, distances from the true surface, and whether pictures darken where the pose hides light. Draws
+where controls act, where the avatar is unsure, and what inverse rendering gained. Captures given with --drives move the avatar, as its own
+test frames do, with every imputation of its latent code.
 """
 
 import json
@@ -53,8 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
 def _analyze(command: AnalyzeCommand) -> int:
     # Imported after the variant is set, because these modules load torch and Dr.Jit.
     from mitsuba_avatar.analysis.effects import control_effects, liveliest_controls
-    from mitsuba_avatar.analysis.measures import Study, disentanglement, geometry_errors
+    from mitsuba_avatar.analysis.measures import Splits, Study, disentanglement, geometry_errors
     from mitsuba_avatar.analysis.pictures import FieldPainter, save_effects, save_geometry_gain, save_uncertainty
+    from mitsuba_avatar.analysis.shading import shading_errors
     from mitsuba_avatar.loaded_run import LoadedRun
     from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
 
@@ -72,6 +74,8 @@ def _analyze(command: AnalyzeCommand) -> int:
         effects = control_effects(study, liveliest_controls(study))
         progress.update("disentanglement", 0, 1)
         report = {"disentanglement": disentanglement(study), "geometry": geometry_errors(study, command.frames)}
+        progress.update("shading", 0, 1)
+        report["shading"] = shading_errors(loaded.evaluator(), Splits.of(loaded.capture, command.frames).frames)
         if command.drives:
             report["imputation"] = _imputations(command, loaded, study, progress)
         report["share_outside_region"] = {effect.name: effect.share_outside for effect in effects}

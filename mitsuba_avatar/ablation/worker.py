@@ -36,6 +36,7 @@ def _limit_threads(threads: int) -> None:
 
 def _work(run: PlannedRun) -> int:
     from mitsuba_avatar.analysis.measures import Splits, Study, disentanglement, geometry_errors, image_errors
+    from mitsuba_avatar.analysis.shading import shading_errors
     from mitsuba_avatar.fitting import Fit
     from mitsuba_avatar.progress import progress_bar
     from mitsuba_avatar.rendering.surface import SurfaceRenderer
@@ -60,9 +61,10 @@ def _work(run: PlannedRun) -> int:
     if run.settings.loss.looks_at_images:
         samples = run.settings.evaluation.samples_per_pixel
         renderer = SurfaceRenderer(fit.run.rig.topology, fit.reader.width, fit.reader.height, samples)
-        splits = Splits.of(fit.capture, most)
+        evaluator, splits = Evaluator(avatar, fit.reader, renderer), Splits.of(fit.capture, most)
         with progress_bar("measuring pictures", sum(map(len, splits.frames.values()))) as bar:
-            measures["images"] = image_errors(Evaluator(avatar, fit.reader, renderer), splits, bar.update)
+            measures["images"] = image_errors(evaluator, splits, bar.update)
+        measures["shading"] = shading_errors(evaluator, {name: splits.frames[name] for name in ("train", "test") if name in splits.frames})
     if fit.capture.vertices is not None:
         study = Study.of(avatar, fit.run.rig, fit.capture)
         measures["geometry"] = geometry_errors(study, most)
