@@ -112,7 +112,10 @@ def _how_to_resume(path: Path) -> str:
     except FileNotFoundError:
         index = None
     if index is None:
-        return "Interrupted before the first checkpoint; there is nothing to resume.\n"
+        return (
+            "Interrupted before the first checkpoint: no training to resume. Filmed images and baked occlusion are kept; "
+            "give the same command again to go on from them.\n"
+        )
     command, flag = "python -m mitsuba_avatar.fit", "--run"
     if PROCESS.is_distributed:
         command, flag = f"torchrun --nproc_per_node {PROCESS.num_ranks} -m mitsuba_avatar.fit", "--run-folder"

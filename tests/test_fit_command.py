@@ -187,7 +187,7 @@ def test_an_interruption_before_the_first_checkpoint_says_so(tmp_path, private_c
 
     monkeypatch.setattr("mitsuba_avatar.fitting.training_statistics", interrupt)
     assert fit(drawn_capture.path, tmp_path / "run") == 130
-    assert "Interrupted before the first checkpoint; there is nothing to resume." in capsys.readouterr().err
+    assert "Interrupted before the first checkpoint: no training to resume. Filmed images" in capsys.readouterr().err
 
 
 def test_a_finished_run_can_be_presented_again(fitted_run, private_cache, tmp_path):
