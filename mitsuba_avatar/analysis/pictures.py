@@ -98,7 +98,7 @@ class FieldPainter:
             textures.append(colour * (AMBIENT + (1 - AMBIENT) * (normals * towards[:, None, None]).sum(0).clamp(min=0)))
         white = torch.ones(3)
         image, _ = self.renderer.render(painted.vertices[None], torch.stack(textures), batch, background=white)
-        display = encode(image.clamp(0, 1), "srgb").permute(0, 2, 3, 1).numpy()
+        display = encode(image.cpu().clamp(0, 1), "srgb").permute(0, 2, 3, 1).numpy()
         return np.concatenate(list(display), axis=1)
 
 
