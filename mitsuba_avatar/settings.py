@@ -54,7 +54,7 @@ class ModelSettings:
     use_localization: bool = True  # False: the driving signal reaches every location of the conditioning maps
     use_compression: bool = True  # False: masked signals enter the decoder without the two-layer projection
     use_shadow: bool = True  # False: no ambient-occlusion-fed gain map
-    latent_size: int = 128  # entries of z (paper: 512)
+    latent_size: int = 16  # entries of z (paper: 512); 128 did not fit the embedded capture better (docs/results/default_fit.md)
     conditioning_size: int = 32  # texels of the driving-signal maps e_theta, e_f (paper: 32)
     latent_channels: tuple[int, ...] = (64, 48, 32)  # features from z, each a doubling on; the last at conditioning_size
     pose_embedding_channels: int = 16  # of e_theta
@@ -129,7 +129,8 @@ class LossSettings:
     mask: float = 0.5  # per fraction of the foreground that is covered wrongly
     geometry: float = 1.0  # per square centimetre of mean squared vertex distance
     laplacian: float = 1.0  # per square centimetre of mean squared difference of mesh Laplacians
-    kl: float = 1e-4  # per nat and pose, summed over the latent code; variational preferencing (section 3.5.1) is to raise it
+    kl: float = 2e-4  # per nat and pose, summed over the latent code; variational preferencing (section 3.5.1) is to raise it
+    kl_warm_up: int = 0  # iterations over which the weight of `kl` rises to its full size; for codes that die before they are of use
     mutual_information: float = 0.0  # per nat that the latent code is estimated to tell about the driving signal (section 3.5.2)
     perturbation: float = 0.0  # per square centimetre that a latent code drawn from the prior moves the driven keypoints (section 3.5.3)
     geometry_iterations: int = 300  # mesh supervision ends here (paper: 2000)
@@ -137,7 +138,7 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         expect(self, "zero or more", "image", "mask", "geometry", "laplacian", "kl", "geometry_iterations", "geometry_after")
-        expect(self, "zero or more", "mutual_information", "perturbation")
+        expect(self, "zero or more", "kl_warm_up", "mutual_information", "perturbation")
 
     @property
     def looks_at_images(self) -> bool:

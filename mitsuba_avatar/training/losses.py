@@ -116,9 +116,11 @@ def loss_weights(settings: LossSettings, iteration: int) -> dict[str, float]:
     """Weight of every term that counts at this iteration (0 is the first); a term of weight zero is left out.
 
     Mesh supervision leads the way, then steps back for the images (section 3.6): `geometry` is multiplied by `geometry_after` from
-    iteration `geometry_iterations` on.
+    iteration `geometry_iterations` on. `kl` rises in equal steps, and has its full weight in iteration `kl_warm_up` - 1 and later.
     """
     weights = {name: getattr(settings, name) for name in TERMS}
+    if iteration < settings.kl_warm_up:
+        weights["kl"] *= (iteration + 1) / settings.kl_warm_up
     if iteration >= settings.geometry_iterations:
         weights["geometry"] *= settings.geometry_after
     return {name: weight for name, weight in weights.items() if weight > 0}

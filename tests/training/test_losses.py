@@ -146,6 +146,13 @@ def test_mesh_supervision_steps_back_after_its_iterations():
     assert "geometry" not in loss_weights(LossSettings(geometry_iterations=10, geometry_after=0.0), 10)
 
 
+def test_the_kl_term_warms_up_in_equal_steps():
+    settings = LossSettings(kl=1e-3, kl_warm_up=4)
+    weights = [loss_weights(settings, iteration)["kl"] for iteration in range(6)]
+    assert weights == pytest.approx([2.5e-4, 5e-4, 7.5e-4, 1e-3, 1e-3, 1e-3])
+    assert loss_weights(LossSettings(kl=1e-3), 0)["kl"] == 1e-3
+
+
 def test_only_terms_with_a_weight_are_evaluated(monkeypatch):
     monkeypatch.setattr(losses, "mask_loss", None)  # calling it would raise
     image, target, mask = make_images()
