@@ -32,12 +32,13 @@ from mitsuba_avatar.reporting.disentanglement import (
 )
 from mitsuba_avatar.reporting.evaluation import Evaluator
 from mitsuba_avatar.reporting.metrics import l1_in_mask, mse_in_mask, psnr_from_mse, silhouette_iou
+from mitsuba_avatar.ridge import ridge_prediction
 from mitsuba_avatar.training.statistics import evenly_spaced
 
 MILLIMETRES = 1000.0  # in a metre
 AT_ONCE = 8  # frames
-PRINCIPAL = 16  # directions of the hidden state that the probe is asked for
-RIDGE = 10.0  # of the regression on pose that the hidden state is what is left of, in deviations of an angle
+PRINCIPAL = 64  # directions of the garment's shape that the hidden state is told in
+STEADY = 1e-4  # radians: an angle that varies less tells nothing
 FEWEST_FRAMES = 64  # of training that an estimate of mutual information is worth making on
 Progress = Callable[[int, int], None]
 
@@ -186,7 +187,7 @@ def disentanglement(study: Study, seed: int = 0) -> dict:
     Returns:
         `spurious` (see `spurious_effects`); `LatentUse` over training frames; `mutual_information_nats` by a fresh estimator;
         `latent_swap` and `drive_swap` on test frames; `hidden_state_r2`, what a linear probe reads off z of the garment's state that
-        pose does not tell, on validation and test frames (where the truth is known).
+        a linear probe of the pose does not tell (partial R^2), on validation and test frames (where the truth is known).
     """
     result: dict = {"spurious": spurious_effects(study, seed)}
     if study.posterior is None:
@@ -244,7 +245,7 @@ def spurious_effects(study: Study, seed: int = 0) -> dict[str, float]:
 
 
 def _hidden_state(study: Study, train: list[int]) -> Float[np.ndarray, "N K"]:
-    """The garment's true shape in rest space, less what ridge regression on the pose angles tells of it: main directions, metres."""
+    """The garment's true shape in rest space, main directions, less what ridge regression on the pose angles tells of it, metres."""
     avatar, count = study.avatar, len(study.capture.frames)
     garment = []
     for start in range(0, count, AT_ONCE):
@@ -254,14 +255,14 @@ def _hidden_state(study: Study, train: list[int]) -> Float[np.ndarray, "N K"]:
             avatar.unpose(exact, study.drive.theta[rows], study.drive.root[rows])[:, torch.from_numpy(study.garment)].flatten(1).numpy()
         )
     shape = np.concatenate(garment).astype(np.float64)
-    angles = study.drive.theta.double().numpy()
-    moving = angles[train].std(0) > 1e-4
-    angles = (angles - angles[train].mean(0))[:, moving] / angles[train].std(0)[moving]
     shape -= shape[train].mean(0)
-    gram = angles[train].T @ angles[train] + RIDGE * np.eye(angles.shape[1])
-    residual = shape - angles @ np.linalg.solve(gram, angles[train].T @ shape[train])
-    _, _, directions = np.linalg.svd(residual[train], full_matrices=False)
-    return residual @ directions[:PRINCIPAL].T
+    _, _, directions = np.linalg.svd(shape[train], full_matrices=False)
+    state = shape @ directions[:PRINCIPAL].T
+    angles = study.drive.theta.double().numpy()
+    mean, spread = angles[train].mean(0), angles[train].std(0)
+    moving = spread > STEADY
+    angles = (angles - mean)[:, moving] / spread[moving]
+    return state - ridge_prediction(angles[train], state[train], angles)
 
 
 @torch.no_grad()

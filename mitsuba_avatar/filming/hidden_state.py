@@ -7,18 +7,15 @@ signal can explain: how far two simulations drift apart whose garments started a
 Symbols: N frames, D pose angles, C vertices of the garment in rest space. Metres; figures are in millimetres.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
-from scipy.linalg import cho_factor, cho_solve
 
 from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.filming.garment_mesh import GarmentMesh
+from mitsuba_avatar.ridge import ridge_prediction
 
-PENALTIES = tuple(10.0**power for power in range(-3, 5))  # of the linear regression, relative to unit variance of the angles
-BLOCKS = 5  # of consecutive training frames, each predicted from the others to choose the penalty
 STEADY = 1e-4  # radians: an angle that varies less explains nothing
 INFLUENCE = 0.02  # mean skinning weight from which a joint counts as moving the garment
 LINEAR_BEATS_MEAN = 0.85  # gate: the error of linear regression relative to the mean garment's, at most
@@ -126,7 +123,7 @@ def measure_hidden_state(
         train_frames=int(is_train.sum()),
         test_frames=int((~is_train).sum()),
         mean=error(np.zeros_like(test[1])),
-        linear=error(_linear(train[0] / spread, train[1], test[0] / spread)),
+        linear=error(ridge_prediction(train[0] / spread, train[1], test[0] / spread)),
         nearest=error(train[1][_nearest(train[0], test[0], neighbours)].mean(axis=1)),
         floor=floor,
     )
@@ -136,29 +133,6 @@ def angles_that_move(rig: Rig, mesh: GarmentMesh) -> Int[np.ndarray, "A"]:
     """Rows of the pose angles that turn a joint which carries part of a garment."""
     influence = mesh.skinning_weights.max(axis=0) > INFLUENCE
     return np.flatnonzero(influence[rig.dofs.joints])
-
-
-def _linear(angles: np.ndarray, garment: np.ndarray, asked: np.ndarray) -> Float[np.ndarray, "M X"]:
-    """Ridge regression, solved over frames because they are fewer than coordinates; the penalty is chosen on blocks of frames."""
-    gram = angles @ angles.T
-    count = len(angles)
-    blocks = np.array_split(np.arange(count), min(BLOCKS, count))
-
-    def loss(penalty: float) -> float:
-        total = 0.0
-        for block in blocks:
-            rest = np.setdiff1d(np.arange(count), block)
-            predicted = _solve(gram[np.ix_(rest, rest)], garment[rest], penalty)(gram[np.ix_(block, rest)])
-            total += float(((predicted - garment[block]) ** 2).sum())
-        return total
-
-    best = min(PENALTIES, key=loss)
-    return _solve(gram, garment, best)(asked @ angles.T)
-
-
-def _solve(gram: np.ndarray, targets: np.ndarray, penalty: float) -> Callable[[np.ndarray], np.ndarray]:
-    coefficients = cho_solve(cho_factor(gram + penalty * np.eye(len(gram))), targets)
-    return lambda cross: cross @ coefficients
 
 
 def _nearest(angles: np.ndarray, asked: np.ndarray, neighbours: int) -> Int[np.ndarray, "M K"]:

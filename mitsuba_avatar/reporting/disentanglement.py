@@ -20,8 +20,10 @@ from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.model.disentanglement import StatisticsNetwork, corrected_objective, mismatched, mutual_information_bound
 from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.model.keypoints import DrivenKeypoints
+from mitsuba_avatar.ridge import ridge_prediction
 
 MILLIMETRES = 1000.0  # in a metre
+SMALLEST_DEVIATION = 0.01  # of an entry of z that a probe reads, relative to the largest one: noise is not blown up to unit size
 ACTIVE_VARIANCE = 0.01  # of an entry's posterior mean over the frames; below it the entry says nothing (Burda et al., arXiv:1509.00519)
 
 WIDTH, PAIRS, MISMATCHES, RATE = 128, 256, 2, 0.05  # of a fresh estimator: hidden features, mini-batch, shuffles of it, moving average
@@ -110,7 +112,7 @@ def fresh_mutual_information(
     for judge in range(4):
         is_judge, is_stop = quarter == judge, quarter == (judge + 1) % 4
         groups = [torch.nonzero(group)[:, 0] for group in (~(is_judge | is_stop), is_stop, is_judge)]
-        bounds.append(_judged_bound(posterior, driving, groups, steps, seed + judge))
+        bounds.append(_judged_bound(posterior, driving, groups, steps, 4 * seed + judge))
     return max(float(np.mean(bounds)), 0.0)
 
 
@@ -119,25 +121,28 @@ def linear_probe(
     target: Float[np.ndarray, "N T"],
     held_out_z: Float[np.ndarray, "M Z"],
     held_out_target: Float[np.ndarray, "M T"],
-    strengths: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0, 10.0),
 ) -> float:
-    """How much of a state a ridge regression reads off z: R^2 on held-out frames; 1 all of it, 0 no more than the mean.
+    """How much of a state a ridge regression reads off z: R^2 on held-out frames; 1 all of it, 0 no more than the training mean.
 
     Args:
-        z, target: of frames in order of time; the last quarter of them chooses the strength of the ridge.
+        z, target: of frames in order of time, N > 1.
         held_out_z, held_out_target: of frames that judge.
-        strengths: candidates, per frame and in units of the variance of an entry of z.
 
     Returns:
-        1 - squared error / squared deviation from the mean of the held-out target, over all its entries; can be negative.
+        1 - squared error / squared deviation of the held-out target from the training mean, over all its entries; can be negative.
+        For a target that is what pose leaves over, this is the partial R^2 of z given the pose.
 
     Raises:
-        ValueError: if the held-out target does not vary.
+        ValueError: if the held-out target does not differ from the training mean.
     """
-    cut = 3 * len(z) // 4
-    choices = [_ridge_score(z[:cut], target[:cut], z[cut:], target[cut:], strength) for strength in strengths]
-    best = strengths[int(np.argmax(choices))]
-    return _ridge_score(z, target, held_out_z, held_out_target, best)
+    mean, deviation, target_mean = z.mean(0), z.std(0), target.mean(0)
+    deviation = np.maximum(deviation, SMALLEST_DEVIATION * max(float(deviation.max()), np.finfo(np.float64).tiny))
+    codes, asked = (((rows - mean) / deviation).astype(np.float64) for rows in (z, held_out_z))
+    total = float(np.square(held_out_target - target_mean).sum())
+    if total == 0:
+        raise ValueError("linear_probe(): expected held-out targets that differ from the training mean; got none. Choose other frames.")
+    error = held_out_target - target_mean - ridge_prediction(codes, target - target_mean, asked)
+    return 1 - float(np.square(error).sum()) / total
 
 
 def other_frames(driving: Float[Tensor, "N D"], seed: int = 0, farther_than: float = 0.5) -> Int[Tensor, "N"]:
@@ -261,19 +266,6 @@ def _draw(posterior: Posterior, rows: Tensor, generator: torch.Generator) -> Ten
     """z of some frames."""
     mu, logvar = posterior.mu[rows], posterior.logvar[rows]
     return Posterior(mu, logvar).sample(torch.randn(mu.shape, generator=generator).to(mu))
-
-
-def _ridge_score(z: np.ndarray, target: np.ndarray, held_out_z: np.ndarray, held_out_target: np.ndarray, strength: float) -> float:
-    mean, target_mean = z.mean(0), target.mean(0)
-    centred = (z - mean).astype(np.float64)
-    gram = centred.T @ centred / len(z)
-    gram += strength * max(np.trace(gram) / len(gram), np.finfo(np.float64).tiny) * np.eye(len(gram))
-    weights = np.linalg.solve(gram, centred.T @ (target - target_mean) / len(z))
-    error = held_out_target - target_mean - (held_out_z - mean) @ weights
-    deviation = float(np.square(held_out_target - held_out_target.mean(0)).sum())
-    if deviation == 0:
-        raise ValueError("linear_probe(): expected a target that varies over the frames that judge; got a constant. Choose other frames.")
-    return 1 - float(np.square(error).sum()) / deviation
 
 
 def _portions(count: int) -> list[slice]:
