@@ -8,11 +8,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from mitsuba_avatar.ablation.plan import REHEARSAL, plan_runs
+from mitsuba_avatar.ablation.plan import REHEARSAL, capture_digest, plan_runs
 from mitsuba_avatar.ablation.rows import choose_rows
 from mitsuba_avatar.ablation.schedule import default_jobs, run_workers
 from mitsuba_avatar.ablation.table import markdown, write_tables
 from mitsuba_avatar.body.source_captures import capture_folder
+from mitsuba_avatar.captures.formats.opening import SourceName
 from mitsuba_avatar.command_line import interruptible, parse_command
 from mitsuba_avatar.files import check_writable
 from mitsuba_avatar.filming.settings import StudioSettings
@@ -47,7 +48,12 @@ def main(arguments: list[str] | None = None) -> int:
         folder = Path(command.out or ("runs/rehearsal" if command.rehearsal else "runs/ablation"))
         check_writable(folder)
         capture = capture_folder(command.capture, tracked) if command.capture else _study(command.variant)
-        runs = plan_runs(folder, rows, command.seeds, command.budget, capture, [*(REHEARSAL if command.rehearsal else ()), *overrides])
+        # Of a data set read in place, the folder in the cache is named after the data set's state: its path tells as much.
+        digest = capture_digest(capture) if SourceName.parse(command.capture) is None else None
+        words = [*(REHEARSAL if command.rehearsal else ()), *overrides]
+        runs = plan_runs(folder, rows, command.seeds, command.budget, capture, words, digest)
+        for run in runs:
+            run.note_capture()
         iterations = sum(run.settings.training.iterations for run in runs)
         with progress_bar("ablation", iterations, sum(run.iterations_done() for run in runs)) as bar:
             try:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -38,6 +39,7 @@ from mitsuba_avatar.reporting.view_transform import ViewTransform
 from mitsuba_avatar.settings import Settings
 from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.distributed import Process, join_processes, leave_processes
+from mitsuba_avatar.training.divergence import SkippedStep
 from mitsuba_avatar.training.loop import MetricsLog, Trainer
 from mitsuba_avatar.training.readiness import check_trainable, open_as_set
 from mitsuba_avatar.training.run_folder import CAMERA_RESPONSE_FILE, RunFolder
@@ -121,7 +123,13 @@ class Fit:
         return Fit(settings, run, trainer, occlusion, process)
 
     def train(self) -> bool:
-        """Train to the end; False if the user stopped it, with everything saved."""
+        """Train to the end; False if the user stopped it, with everything saved.
+
+        The log names every skipped batch, of a run that bad steps stop too. Lines at skipped iterations have no loss terms.
+
+        Raises:
+            DivergedError: too many bad steps; see `Trainer.run`.
+        """
         training, draws = self.settings.training, self.settings.loss.looks_at_images
         trainer, is_main = self.trainer, self.process.is_main
         evaluator, presentation = self._tools(samples_per_pixel=4)
@@ -144,12 +152,11 @@ class Fit:
                 if iteration % LOG_EVERY == 0 or psnr is not None:
                     record = {"iteration": iteration, **terms, "learning_rate": trainer.learning_rate(iteration - 1)}
                     milliseconds = {f"{name}_ms": value for name, value in trainer.timer.means().items()}
-                    skipped = [dataclasses.asdict(step) for step in trainer.guard.tell()]
                     log.write(
                         record
                         | milliseconds
                         | ({} if psnr is None else {"validation_psnr": psnr})
-                        | ({"skipped": skipped, "skipped_in_all": trainer.guard.num_skipped} if skipped else {})
+                        | skipped_record(trainer.guard.tell(), trainer.guard.num_skipped)
                     )
                 if draws and (iteration % training.preview_every == 0 or is_last):
                     save_image(self.run.previews / f"{iteration:06d}.png", presentation.preview(shots))
@@ -159,7 +166,14 @@ class Fit:
                         trainer.response.write_facts(self.run.path / CAMERA_RESPONSE_FILE)
                 return not is_stopping
 
-            return trainer.run(after_step)
+            try:
+                return trainer.run(after_step)
+            finally:  # the bad step that stops a run never comes to after_step, and those since the last line are still untold
+                skipped = trainer.guard.tell()
+                if log is not None and skipped:
+                    # Counted as done: a run resumed before it repeats the step, and drops this line.
+                    iteration = max(trainer.iteration, skipped[-1].iteration + 1)
+                    log.write({"iteration": iteration} | skipped_record(skipped, trainer.guard.num_skipped))
 
     def present(self) -> None:
         """Evaluate the avatar and draw it: metrics, pictures, orbit.
@@ -240,6 +254,16 @@ class Fit:
                     yield ViewTransform().apply(frame.radiance, frame.coverage)
 
             write_video(self.run.path / "orbit.mp4", pictures(), fps=12.0)
+
+
+def skipped_record(steps: list[SkippedStep], in_all: int) -> dict[str, Any]:
+    """What a line of the log says of steps skipped since the last one: nothing where there are none.
+
+    Args:
+        steps: skipped since then.
+        in_all: number of steps that the whole run skipped.
+    """
+    return {"skipped": [dataclasses.asdict(step) for step in steps], "skipped_in_all": in_all} if steps else {}
 
 
 def frame_occlusion(settings: Settings, rig: Rig, avatar: Avatar, capture: Capture) -> FrameOcclusion:

@@ -1,13 +1,16 @@
 """Which runs an ablation consists of, where each lies, and what is still to be done.
 
 ```
-DIR/ours/seed_0/            a run folder (training/run_folder.py), measures.json beside its checkpoints, worker.log
+DIR/ours/seed_0/            a run folder (training/run_folder.py), measures.json beside its checkpoints, worker.log, capture.json
 DIR/table.json, .md, .tex   when every run is measured
 ```
 """
 
 import dataclasses
+import hashlib
 import json
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +23,10 @@ from mitsuba_avatar.settings import Settings
 REHEARSAL = ("loss.image=0.0", "loss.mask=0.0", "loss.geometry_after=1.0", "training.poses_per_batch=4", "training.views_per_pose=1")
 MEASURES = "measures.json"
 PLANNED = "planned.yaml"  # settings that a worker is told to train with
+CAPTURE_NOTE = "capture.json"  # which content of the capture a run was begun on
+DIGESTED_ARRAYS = ("theta", "root", "face", "vertices")  # of a capture: what is learnt from
+COUNTED_FOLDERS = ("images", "masks", "backgrounds")
+BLOCK_BYTES = 1 << 22  # read at a time
 
 
 @dataclass(frozen=True)
@@ -30,11 +37,13 @@ class PlannedRun:
         row: which.
         settings: resolved, seed included.
         path: run folder.
+        digest: of the capture as it is now, see `capture_digest`; None where it is not known.
     """
 
     row: Row
     settings: Settings
     path: Path
+    digest: str | None = None
 
     @property
     def is_measured(self) -> bool:
@@ -67,6 +76,32 @@ class PlannedRun:
         with atomic_path(self.measures_path) as temporary:
             temporary.write_text(json.dumps(measures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
+    def note_capture(self) -> None:
+        """Keep the digest of the capture beside the run, before a worker begins it; a run that goes on keeps the one it was begun with."""
+        if self.is_begun or self.is_measured:
+            return
+        if self.digest is None:
+            (self.path / CAPTURE_NOTE).unlink(missing_ok=True)
+            return
+        with atomic_path(self.path / CAPTURE_NOTE) as temporary:
+            temporary.write_text(json.dumps({"digest": self.digest}) + "\n", encoding="utf-8")
+
+    def noted_digest(self) -> str | None:
+        """Digest of the capture that the run was begun on; None where none was noted.
+
+        Raises:
+            ValueError: the note is damaged.
+        """
+        note = self.path / CAPTURE_NOTE
+        if not note.is_file():
+            return None
+        try:
+            return json.loads(note.read_text(encoding="utf-8"))["digest"]
+        except (ValueError, KeyError, TypeError) as error:  # no JSON, or other JSON
+            raise ValueError(
+                f"noted_digest(): expected the digest of a capture in {note}; got {error!r}. Remove the run's folder to train it again."
+            ) from error
+
     def iterations_done(self) -> int:
         """Iterations that the run's log tells of; all of them once it is measured."""
         if self.is_measured:
@@ -83,7 +118,9 @@ class PlannedRun:
         return 0
 
 
-def plan_runs(folder: Path, rows: tuple[Row, ...], seeds: int, budget: float, capture: Path, overrides: list[str]) -> list[PlannedRun]:
+def plan_runs(
+    folder: Path, rows: tuple[Row, ...], seeds: int, budget: float, capture: Path, overrides: list[str], digest: str | None = None
+) -> list[PlannedRun]:
     """All runs of an ablation, seed by seed, so that a first complete table comes early.
 
     Args:
@@ -93,9 +130,11 @@ def plan_runs(folder: Path, rows: tuple[Row, ...], seeds: int, budget: float, ca
         budget: factor on the number of iterations of every row.
         capture: that all are trained on.
         overrides: `section.key value` words for every row alike.
+        digest: of the capture, see `capture_digest`; None where it has none. Runs in the folder are not compared with it where they were
+            begun or measured without one, as those of older versions were.
 
     Raises:
-        ValueError: seeds or budget out of range, or the folder holds a run of other settings.
+        ValueError: seeds or budget out of range, or the folder holds a run of other settings, or of other content of the capture.
     """
     if seeds < 1 or budget <= 0:
         raise ValueError(f"plan_runs(): expected seeds of at least 1 and a positive budget; got {seeds} and {budget:g}.")
@@ -103,10 +142,54 @@ def plan_runs(folder: Path, rows: tuple[Row, ...], seeds: int, budget: float, ca
     for seed in range(seeds):
         for row in rows:
             settings = resolve(row.preset, [*overrides, f"capture.path={capture.absolute()}", f"training.seed={seed}"])
-            planned = PlannedRun(row, _scaled(settings, budget), folder / row.name / f"seed_{seed}")
+            planned = PlannedRun(row, _scaled(settings, budget), folder / row.name / f"seed_{seed}", digest)
             _check_same(planned)
+            _check_same_capture(planned)
             runs.append(planned)
     return runs
+
+
+def capture_digest(capture: Path) -> str | None:
+    """What tells a capture from another one in the same folder, say after it was filmed again: SHA-256 in hexadecimal.
+
+    Of the names and bytes of description, cameras, frames and of the arrays that are learnt from, read in blocks. Images, masks and plates
+    are too many to be read: their number and total size count, so that other pixels in as many bytes go unseen. Rig and `truth/` do not
+    count. 150 MB of arrays and 7000 images take about a second.
+
+    Args:
+        capture: folder of a capture.
+
+    Returns:
+        64 digits; None where there is no whole capture.
+    """
+    # They load torch, and a worker imports this module before its variant is set.
+    from mitsuba_avatar.captures.arrays import FRAME_ARRAYS
+    from mitsuba_avatar.captures.folder import CAMERAS_FILE, DESCRIPTION_FILE, FRAMES_FILE
+
+    if not (capture / DESCRIPTION_FILE).is_file():
+        return None
+    digest = hashlib.sha256()
+    for name in (DESCRIPTION_FILE, CAMERAS_FILE, FRAMES_FILE, *(FRAME_ARRAYS[name].file_name for name in DIGESTED_ARRAYS)):
+        if (capture / name).is_file():
+            digest.update(f"{name} {(capture / name).stat().st_size}\n".encode())
+            for block in _blocks(capture / name):
+                digest.update(block)
+    for name in COUNTED_FOLDERS:
+        sizes = _file_sizes(capture / name)
+        digest.update(f"{name} {len(sizes)} {sum(sizes)}\n".encode())
+    return digest.hexdigest()
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    """A file's bytes, so that memory does not grow with the file."""
+    with path.open("rb") as file:
+        while block := file.read(BLOCK_BYTES):
+            yield block
+
+
+def _file_sizes(folder: Path) -> list[int]:
+    """Bytes of every file below a folder; temporary files, whose names start with a dot, do not count."""
+    return [(Path(here) / name).stat().st_size for here, _, names in os.walk(folder) for name in names if not name.startswith(".")]
 
 
 def _scaled(settings: Settings, budget: float) -> Settings:
@@ -125,15 +208,31 @@ def _check_same(planned: PlannedRun) -> None:
     saved = planned.path / "settings.yaml"
     if not saved.is_file():
         return
-    was, wanted = load_settings(saved), planned.settings
-    changed = [
-        f"{section}.{name} {before} -> {after}"
-        for section in ("capture", "model", "loss", "disentanglement", "camera_response", "training", "evaluation")
-        for name, before in dataclasses.asdict(getattr(was, section)).items()
-        if before != (after := dataclasses.asdict(getattr(wanted, section))[name])
-    ]
+    was, wanted = _compared(load_settings(saved)), _compared(planned.settings)
+    changed = [f"{key} {before} -> {wanted[key]}" for key, before in was.items() if before != wanted[key]]
     if changed:
         raise ValueError(
             f"plan_runs(): expected {planned.path} to be new or of the same settings; got {', '.join(changed)}. "
             "Name another folder with --out."
+        )
+
+
+def _compared(settings: Settings) -> dict[str, object]:
+    """Dotted key -> value of every setting, except the variant: it says where a run is computed, and "auto" is resolved when it begins."""
+    sections = dataclasses.asdict(settings)
+    del sections["rendering"]["variant"]
+    return {f"{section}.{name}": value for section, values in sections.items() for name, value in values.items()}
+
+
+def _check_same_capture(planned: PlannedRun) -> None:
+    """The same path is not the same capture: it may have been filmed again. What older versions left has no digest, and is accepted."""
+    now = planned.digest
+    if now is None or not (planned.is_measured or planned.is_begun):
+        return
+    was = planned.measures().get("capture_digest") if planned.is_measured else planned.noted_digest()
+    if was is not None and was != now:
+        raise ValueError(
+            f"plan_runs(): expected {planned.path} to be new or of the capture that is in {planned.settings.capture.path} now (digest "
+            f"{now[:12]}); got a run that was {'measured' if planned.is_measured else 'begun'} on other content of it (digest {was[:12]}). "
+            "Name another folder with --out, or put the capture back as it was."
         )

@@ -17,7 +17,9 @@ from mitsuba_avatar.files import atomic_path
 LATENT_FIGURES = ("kl_nats", "active_entries", "frame_information_nats", "mutual_information_nats")  # of a run's measures
 LATENT_DECIMALS = (1, 0, 2, 2)
 LATENT_HEADINGS = ("KL (nats)", "active", "I(z; frame)", "I(z; drive)")  # the same, as the table calls them
-HEADINGS = ("model", "train", "validation", "test", "over ours", "gap", *LATENT_HEADINGS, "paper train", "paper test")
+PAPER_HEADINGS = ("paper train", "paper test")
+HEADINGS = ("model", "train", "validation", "test", "over ours", "gap", *LATENT_HEADINGS, *PAPER_HEADINGS)
+COST_HEADINGS = ("seeds", "minutes", "thousand parameters")  # before the paper's, in Markdown alone: the LaTeX is wide enough
 REFERENCE = "ours"  # row that the others are compared with, seed by seed
 
 
@@ -49,6 +51,9 @@ class Entry:
     errors: dict[str, Spread]
     excesses: tuple[float, ...]  # per cent that the test error is above that of ours with the same seed; none for ours itself
     latent: tuple[Spread | None, ...]  # LATENT_FIGURES
+    seeds: int  # that are measured
+    minutes: float | None  # of training, mean over seeds; None where a run does not tell
+    parameters: int | None  # of the avatar
 
     @property
     def gap(self) -> float | None:
@@ -70,6 +75,7 @@ def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
             continue
         errors = [driven_errors(one) for one in measured]
         parts = [one.get("disentanglement", {}) for one in measured]
+        minutes = [_scaled(one, "training_seconds", 60) for one in measured]
         pairs = [(error["test"], ours[one["seed"]]) for error, one in zip(errors, measured, strict=True) if ours.get(one["seed"])]
         entries.append(
             Entry(
@@ -77,6 +83,9 @@ def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
                 {split: Spread.of([one[split] for one in errors]) for split in errors[0]},
                 tuple(100 * (test / reference - 1) for test, reference in pairs) if row.name != REFERENCE else (),
                 tuple(_spread(parts, name) for name in LATENT_FIGURES),
+                len(measured),
+                None if None in minutes else float(np.mean(minutes)),
+                measured[0].get("parameters"),
             )
         )
     return entries
@@ -92,30 +101,46 @@ def driven_errors(measures: dict) -> dict[str, float]:
 
 def markdown(entries: Sequence[Entry]) -> str:
     """The table as Markdown; the lowest train and test errors are bold. "over ours": test error above that of ours with the same seed, mean
-    and deviation over seeds, and in how many seeds it is above."""
-    lines = ["| " + " | ".join(HEADINGS) + " |", "|" + "---|" * len(HEADINGS)]
-    lines += ["| " + " | ".join(_cells(entry, entries, "**{}**", " ± ", "%")) + " |" for entry in entries]
-    return "\n".join(lines) + "\n"
+    and deviation over seeds, and in how many seeds it is above. A row with fewer seeds than others says so, and is never bold."""
+    rows = [HEADINGS, *(_cells(entry, entries, "**{}**", " ± ", "%") for entry in entries)]
+    costs = [COST_HEADINGS, *(_cost_cells(entry, entries) for entry in entries)]
+    lines = [
+        "| " + " | ".join((*row[: -len(PAPER_HEADINGS)], *cost, *row[-len(PAPER_HEADINGS) :])) + " |"
+        for row, cost in zip(rows, costs, strict=True)
+    ]
+    return "\n".join([lines[0], "|" + "---|" * (len(HEADINGS) + len(COST_HEADINGS)), *lines[1:]]) + "\n"
 
 
 def latex(entries: Sequence[Entry]) -> str:
-    """The table as a LaTeX tabular for the package booktabs."""
+    """The table as a LaTeX tabular for the package booktabs; a row with fewer seeds than others says so beside its name."""
     lines = [r"\begin{tabular}{l" + "r" * (len(HEADINGS) - 1) + "}", r"\toprule", " & ".join(HEADINGS) + r" \\", r"\midrule"]
-    lines += [" & ".join(_cells(entry, entries, r"\textbf{{{}}}", r" $\pm$ ", r"\%")) + r" \\" for entry in entries]
+    for entry in entries:
+        title, *cells = _cells(entry, entries, r"\textbf{{{}}}", r" $\pm$ ", r"\%")
+        if entry.seeds < _most_seeds(entries):
+            title += f" ({_seeds(entry, entries)} seeds)"
+        lines.append(" & ".join([title, *cells]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
 def write_tables(folder: Path, runs: Sequence[PlannedRun]) -> list[Entry]:
     """Write table.md, table.tex and table.json of all measured runs into a folder; returns the entries.
 
-    The JSON lists every run: `name, seed, train, test` (see `driven_errors`) and all else that was measured.
+    The JSON lists every run: `name, seed, train, test` (see `driven_errors`), `seeds` (of its row that are measured), `minutes` (of its
+    training), `thousand_parameters`, and all that was measured.
     """
     entries = summarize(runs)
+    seeds = {entry.row: entry.seeds for entry in entries}
     rows = []
     for run in runs:
         if run.is_measured:
             measures = run.measures()
-            rows.append({"name": run.row.name, "seed": measures["seed"], **driven_errors(measures), "measures": measures})
+            errors = driven_errors(measures)
+            costs = {
+                "seeds": seeds[run.row],
+                "minutes": _scaled(measures, "training_seconds", 60),
+                "thousand_parameters": _scaled(measures, "parameters", 1000),
+            }
+            rows.append({"name": run.row.name, "seed": measures["seed"], **errors, **costs, "measures": measures})
     texts = {"table.md": markdown(entries), "table.tex": latex(entries), "table.json": json.dumps(rows, indent=1) + "\n"}
     for name, text in texts.items():
         with atomic_path(folder / name) as temporary:
@@ -124,14 +149,15 @@ def write_tables(folder: Path, runs: Sequence[PlannedRun]) -> list[Entry]:
 
 
 def _cells(entry: Entry, entries: Sequence[Entry], bold: str, between: str, percent: str) -> list[str]:
-    """A row's cells, without the rules between them."""
+    """A row's cells under HEADINGS, without the rules between them."""
+    most = _most_seeds(entries)
 
     def error(split: str) -> str:
         if split not in entry.errors:
             return "-"
-        best = min(other.errors[split].mean for other in entries if split in other.errors)
         text = entry.errors[split].text(between)
-        return bold.format(text) if split != "validation" and entry.errors[split].mean == best else text
+        is_best = split != "validation" and entry.seeds == most and entry.errors[split].mean == _best(split, entries)
+        return bold.format(text) if is_best else text
 
     def optional(value: Spread | None, decimals: int) -> str:
         return "-" if value is None else value.text(between, decimals)
@@ -144,6 +170,34 @@ def _cells(entry: Entry, entries: Sequence[Entry], bold: str, between: str, perc
     published = ["-", "-"] if entry.row.published is None else [f"{value:.3f}" for value in entry.row.published]
     latent = [optional(value, decimals) for value, decimals in zip(entry.latent, LATENT_DECIMALS, strict=True)]
     return [entry.row.title, error("train"), error("validation"), error("test"), excess, gap, *latent, *published]
+
+
+def _cost_cells(entry: Entry, entries: Sequence[Entry]) -> list[str]:
+    """A row's cells under COST_HEADINGS."""
+    minutes = "-" if entry.minutes is None else f"{entry.minutes:.1f}"
+    return [_seeds(entry, entries), minutes, "-" if entry.parameters is None else f"{entry.parameters / 1000:.0f}"]
+
+
+def _seeds(entry: Entry, entries: Sequence[Entry]) -> str:
+    """How many seeds are measured, beside how many the others have where those are more."""
+    most = _most_seeds(entries)
+    return str(entry.seeds) if entry.seeds == most else f"{entry.seeds} of {most}"
+
+
+def _most_seeds(entries: Sequence[Entry]) -> int:
+    return max(entry.seeds for entry in entries)
+
+
+def _best(split: str, entries: Sequence[Entry]) -> float | None:
+    """Lowest error of the rows with all seeds; None where there are no two of them to compare."""
+    most = _most_seeds(entries)
+    means = [entry.errors[split].mean for entry in entries if entry.seeds == most and split in entry.errors]
+    return min(means) if len(means) > 1 else None
+
+
+def _scaled(measures: dict, name: str, unit: int) -> float | None:
+    """A figure in larger units; None where an older run does not have it."""
+    return measures[name] / unit if name in measures else None
 
 
 def _spread(parts: Sequence[dict], name: str) -> Spread | None:

@@ -5,7 +5,6 @@ Started by `ablation.schedule`, with the settings in FOLDER/planned.yaml. Trains
 
 import dataclasses
 import sys
-import time
 from pathlib import Path
 
 from mitsuba_avatar.ablation.plan import PLANNED, PlannedRun
@@ -43,11 +42,8 @@ def _work(run: PlannedRun) -> int:
     from mitsuba_avatar.reporting.evaluation import Evaluator
     from mitsuba_avatar.training.distributed import Process
 
-    started = time.perf_counter()
     fit = Fit.prepare(run.settings, run.path, Process(), is_resumed=run.is_begun)
-    is_finished = fit.train()
-    seconds = time.perf_counter() - started
-    if not is_finished:
+    if not fit.train():
         return 130
     avatar = fit.run.load_avatar("last")
     most = run.settings.evaluation.frames_per_split
@@ -55,9 +51,13 @@ def _work(run: PlannedRun) -> int:
         "name": run.row.name,
         "seed": run.settings.training.seed,
         "iterations": run.settings.training.iterations,
-        "training_seconds": seconds,
+        "training_seconds": fit.trainer.seconds,
+        "num_skipped": fit.trainer.guard.num_skipped,
         "parameters": sum(parameter.numel() for parameter in avatar.parameters()),
     }
+    digest = run.noted_digest()
+    if digest is not None:
+        measures["capture_digest"] = digest
     if run.settings.loss.looks_at_images:
         samples = run.settings.evaluation.samples_per_pixel
         renderer = SurfaceRenderer(fit.run.rig.topology, fit.reader.width, fit.reader.height, samples)

@@ -93,25 +93,27 @@ class Trainer:
         self.guard = DivergenceGuard(training)
         self.iteration = 0
         self.timer = StepTimer()
+        self._seconds_before, self._running_since = 0.0, None
 
     def run(self, after_step: Callable[[int, dict[str, float]], bool]) -> bool:
         """Train from the current iteration to the last.
 
         Args:
-            after_step: called as after_step(iterations done, loss terms); reports and saves. Training stops where it returns False.
+            after_step: called as after_step(iterations done, loss terms); reports and saves. Training stops where it returns False. Where
+                the step was skipped, there are no terms.
 
         Returns:
             Whether the last iteration was reached.
 
         Raises:
-            DivergedError: too many bad steps; single ones are skipped, and after_step gets the terms of the last good one.
+            DivergedError: too many bad steps; single ones are skipped. after_step is not called after the last one; `guard.tell` names it.
         """
-        terms: dict[str, float] = {}
         read = self.reader.read if self.settings.loss.looks_at_images else self.reader.read_surfaces
-        with closing(batches(read, self.sampler, self.iteration, self.settings.training.iterations)) as stream:
+        with self._clock_running(), closing(batches(read, self.sampler, self.iteration, self.settings.training.iterations)) as stream:
             while self.iteration < self.settings.training.iterations:
                 with self.timer.part("data"):
                     batch = next(stream)
+                terms: dict[str, float] = {}
                 try:
                     terms = self.step(batch)
                 except DivergedError as error:
@@ -120,6 +122,12 @@ class Trainer:
                 if not after_step(self.iteration, terms):
                     return False
         return True
+
+    @property
+    def seconds(self) -> float:
+        """Spent in `run`, over all sessions. Of a session that was killed, what came after its last checkpoint does not count: a resumed
+        run repeats those steps."""
+        return self._seconds_before + (0.0 if self._running_since is None else time.perf_counter() - self._running_since)
 
     def step(self, batch: FrameBatch) -> dict[str, float]:
         """One optimisation step.
@@ -188,7 +196,7 @@ class Trainer:
 
     def save(self, checkpoints: Checkpoints, psnr: float | None) -> None:
         """Write a checkpoint; see `Checkpoints.save`."""
-        state = {"optimizer": self.optimizer.state_dict(), "guard": self.guard.state_dict()}
+        state = {"optimizer": self.optimizer.state_dict(), "guard": self.guard.state_dict(), "seconds": self.seconds}
         if self.information is not None:
             state["mutual_information"] = self.information.state_dict()
         if self.response is not None:
@@ -208,10 +216,20 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         if "guard" in state:
             self.guard.load_state_dict(state["guard"])
+        self._seconds_before = state.get("seconds", 0.0)
         if self.information is not None and "mutual_information" in state:
             self.information.load_state_dict(state["mutual_information"])
         if self.response is not None and "camera_response" in state:
             self.response.restore(state["camera_response"])
+
+    @contextmanager
+    def _clock_running(self) -> Iterator[None]:
+        """Let `seconds` grow."""
+        self._running_since = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds_before, self._running_since = self.seconds, None
 
     def _disentanglement(self, rig: Rig) -> tuple[MutualInformation | None, DrivenKeypoints | None]:
         """What the two disentangling terms need, each where its weight asks for it."""

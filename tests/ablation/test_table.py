@@ -25,22 +25,43 @@ def runs(tmp_path: Path) -> list[PlannedRun]:
             else {}
         )
         images = {"train": {"mse": train}, "test": {"mse": test}}
-        run.save_measures({"name": name, "seed": seed, "images": images, "disentanglement": latent})
+        costs = {"training_seconds": 90.0 + 60 * seed, "parameters": 1234567}
+        run.save_measures({"name": name, "seed": seed, **costs, "images": images, "disentanglement": latent})
         planned.append(run)
     return planned
 
 
 def test_markdown_has_means_deviations_and_the_best_in_bold(runs: list[PlannedRun]):
-    lines = markdown(summarize(runs)).splitlines()
-    assert (
-        lines[2]
-        == "| ours | 12.25 ± 0.35 | - | **15.50 ± 0.71** | - | 3.25 | 5.5 ± 0.7 | 40 ± 1 | 1.50 ± 0.00 | 0.25 ± 0.00 | 11.578 | 15.546 |"
+    heading, rule, ours, pose_face = markdown(summarize(runs)).splitlines()
+    assert heading.endswith("| I(z; drive) | seeds | minutes | thousand parameters | paper train | paper test |")
+    assert {line.count("|") for line in (heading, rule, ours, pose_face)} == {16}
+    assert ours == (
+        "| ours | 12.25 ± 0.35 | - | **15.50 ± 0.71** | - | 3.25 | 5.5 ± 0.7 | 40 ± 1 | 1.50 ± 0.00 | 0.25 ± 0.00 "
+        "| 2 | 2.0 | 1235 | 11.578 | 15.546 |"
     )
-    assert lines[3] == "| pose+face | **8.00 ± 1.41** | - | 17.50 ± 0.71 | 13 ± 1 % (2 of 2) | 9.50 | - | - | - | - | 7.647 | 17.509 |"
+    assert pose_face == (
+        "| pose+face | **8.00 ± 1.41** | - | 17.50 ± 0.71 | 13 ± 1 % (2 of 2) | 9.50 | - | - | - | - | 2 | 2.0 | 1235 | 7.647 | 17.509 |"
+    )
 
 
 def test_one_seed_has_no_deviation(runs: list[PlannedRun]):
     assert "| ours | 12.00 | - | **15.00** | - | 3.00 |" in markdown(summarize([runs[0], runs[2]]))
+
+
+def test_a_row_with_fewer_seeds_says_so_and_is_never_bold(runs: list[PlannedRun], tmp_path: Path):
+    """Row without_shadow has the lowest train error of all, and as low a test error as ours, in one seed: the others' best are bold."""
+    lucky = PlannedRun(choose_rows("without_shadow")[0], resolve("ablation/without_shadow"), tmp_path / "without_shadow" / "0")
+    lucky.save_measures({"name": "without_shadow", "seed": 0, "images": {"train": {"mse": 1.0}, "test": {"mse": 15.5}}})
+    entries = summarize([*runs, lucky])
+    text = markdown(entries)
+    assert "| ours, no shadow | 1.00 | - | 15.50 | 3 % (1 of 1) | 14.50 | - | - | - | - | 1 of 2 | - | - | 10.872 | 16.792 |" in text
+    assert "**15.50 ± 0.71**" in text and "**8.00 ± 1.41**" in text and text.count("**") == 4
+    assert r"ours, no shadow (1 of 2 seeds) & 1.00 &" in latex(entries) and latex(entries).count(r"\textbf") == 2
+    assert "seeds" not in latex(entries[:2])
+
+
+def test_nothing_is_best_without_a_rival(runs: list[PlannedRun]):
+    assert "**" not in markdown(summarize(runs[:2])) and "**" not in markdown(summarize(runs[:3]))
 
 
 def test_rows_are_compared_with_ours_of_the_same_seed_alone(runs: list[PlannedRun]):
@@ -64,6 +85,7 @@ def test_files_list_every_run_and_runs_to_come_are_left_out(runs: list[PlannedRu
     write_tables(tmp_path, [*runs, to_come])
     rows = json.loads((tmp_path / "table.json").read_text())
     assert [(row["name"], row["seed"], row["train"], row["test"]) for row in rows] == [(*key, *error) for key, error in ERRORS.items()]
+    assert [(row["seeds"], row["minutes"], row["thousand_parameters"]) for row in rows] == [(2, 1.5, 1234.567), (2, 2.5, 1234.567)] * 2
     assert "shadow" not in (tmp_path / "table.md").read_text() and (tmp_path / "table.tex").is_file()
 
 

@@ -6,12 +6,14 @@ import json
 import pytest
 import torch
 
+from mitsuba_avatar.fitting import Fit
 from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.training.batches import FrameReader
 from mitsuba_avatar.training.checkpoints import Checkpoints
 from mitsuba_avatar.training.distributed import Process
 from mitsuba_avatar.training.loop import DivergedError, MetricsLog, StepTimer
 from mitsuba_avatar.training.losses import evaluate_losses
+from mitsuba_avatar.training.run_folder import RunFolder
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -151,7 +153,7 @@ def test_a_bad_step_is_skipped_counted_and_told(make_trainer, reader):
 
     assert trainer.run(after_step) and trainer.iteration == 5
     assert torch.equal(states[0], states[1]) and not torch.equal(states[1], states[2])
-    assert records[1] == records[0], "the last good step's terms"
+    assert records[1] == {} and records[0] and records[2], "a skipped step has no terms"
     (skipped,) = trainer.guard.tell()
     frames, cameras = trainer.sampler.draw(1)
     assert (skipped.iteration, skipped.cameras) == (1, cameras) and skipped.frames == [frame + 20 for frame in frames]
@@ -165,13 +167,47 @@ def test_an_exploding_step_is_skipped_and_names_the_term(make_trainer, reader):
     assert skipped.iteration == 22 and "times its running mean" in skipped.reason and "most of it from image" in skipped.reason
 
 
-def test_repeated_bad_steps_stop_the_run(make_trainer, reader):
-    damages = dict.fromkeys((2, 4, 5), float("nan"))
-    trainer = make_trainer("training.iterations=9", "training.skipped_steps=2", reader=DamagedReader(reader, damages))
+def make_fit(trainer, rig, folder):
+    """A fit around a trainer, with an empty run folder."""
+    capture = trainer.reader.capture
+    run_folder = RunFolder.create(folder, trainer.settings, rig, capture.path, capture.face.shape[1])
+    return Fit(trainer.settings, run_folder, trainer, trainer.reader.occlusion, Process())
+
+
+def test_repeated_bad_steps_stop_the_run_and_its_log_names_every_batch(make_trainer, reader, rig, tmp_path):
+    """Those before the last line of the log, those after it, and the one that was too many."""
+    damages = dict.fromkeys((2, 11, 13, 14), float("nan"))
+    trainer = make_trainer("training.iterations=19", "training.skipped_steps=3", reader=DamagedReader(reader, damages))
     with pytest.raises(
-        DivergedError, match=r"got 3, 3 in all\. The last one: step\(\): loss term image is not finite at iteration 5, frames"
+        DivergedError, match=r"got 4, 4 in all\. The last one: step\(\): loss term image is not finite at iteration 14, frames"
     ):
-        run(trainer)
+        make_fit(trainer, rig, tmp_path).train()
+    first, last = read_log(tmp_path / "metrics.jsonl")
+    assert (first["iteration"], first["skipped_in_all"], len(first["skipped"])) == (10, 1, 1)
+    assert (last["iteration"], last["skipped_in_all"], len(last["skipped"])) == (15, 4, 3)
+    assert "loss" in first and "loss" not in last
+    for step, iteration in zip([*first["skipped"], *last["skipped"]], damages, strict=True):
+        frames, cameras = trainer.sampler.draw(iteration)
+        assert (step["iteration"], step["cameras"]) == (iteration, cameras) and step["frames"] == [frame + 20 for frame in frames]
+        assert f"loss term image is not finite at iteration {iteration}, frames [" in step["reason"]
+
+
+def test_a_line_of_the_log_never_repeats_older_terms(make_trainer, rig, tmp_path, monkeypatch):
+    """Steps 9 and 10 of twelve are skipped: line 10 has no terms, and the end tells what no line has told."""
+    trainer = make_trainer("loss.image=0", "loss.mask=0", "training.iterations=12")
+    step = trainer.step
+
+    def step_or_fail(batch):
+        if trainer.iteration in (9, 10):
+            raise DivergedError("no luck")
+        return step(batch)
+
+    monkeypatch.setattr(trainer, "step", step_or_fail)
+    assert make_fit(trainer, rig, tmp_path).train()
+    tenth, end = read_log(tmp_path / "metrics.jsonl")
+    assert tenth["iteration"] == 10 and "learning_rate" in tenth and "loss" not in tenth and "geometry" not in tenth
+    assert [skipped["iteration"] for skipped in tenth["skipped"]] == [9]
+    assert end["iteration"] == 12 and [skipped["iteration"] for skipped in end["skipped"]] == [10] and end["skipped_in_all"] == 2
 
 
 @pytest.mark.parametrize("overrides", [("loss.mutual_information=0.1",), ("loss.perturbation=0.5",)], ids=["information", "perturbation"])
@@ -278,6 +314,30 @@ def test_a_resumed_run_continues_the_same_curve(make_trainer, tmp_path, monkeypa
     # Scattered float sums come in another order each time, and Adam's first steps amplify that where gradients are nearly zero.
     assert (parameters(second) - parameters(whole)).abs().mean() < 2e-5
     assert (parameters(first) - parameters(whole)).abs().mean() > 2e-4, "the last three steps do count"
+
+
+def test_seconds_count_training_alone_and_go_on_after_a_checkpoint(make_trainer, tmp_path):
+    """The clock stands before, between and after sessions."""
+    first, second = make_trainer("training.iterations=4"), make_trainer("training.iterations=4")
+    assert first.seconds == 0.0
+    within = []
+    checkpoints = Checkpoints(tmp_path, "rig")
+
+    def after_step(iteration, terms):
+        within.append(first.seconds)
+        if iteration == 2:
+            first.save(checkpoints, None)
+            within.append(first.seconds)
+        return iteration < 3
+
+    first.run(after_step)
+    stopped_at = first.seconds
+    assert 0 < within[0] < within[1] < within[3] < stopped_at == first.seconds
+    second.resume(checkpoints)
+    assert within[1] < second.seconds < within[2], "what came after the checkpoint will be done again"
+    resumed_with = second.seconds
+    run(second)
+    assert second.seconds > resumed_with
 
 
 def test_training_stops_where_it_is_asked_to(make_trainer):
