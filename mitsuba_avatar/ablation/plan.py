@@ -199,7 +199,9 @@ def _scaled(settings: Settings, budget: float) -> Settings:
     return dataclasses.replace(
         settings,
         training=dataclasses.replace(training, iterations=iterations),
-        loss=dataclasses.replace(loss, geometry_iterations=round(loss.geometry_iterations * budget)),
+        loss=dataclasses.replace(
+            loss, geometry_iterations=round(loss.geometry_iterations * budget), kl_warm_up=round(loss.kl_warm_up * budget)
+        ),
     )
 
 

@@ -35,9 +35,10 @@ def capture(tmp_path: Path) -> Path:
 
 
 def test_seeds_are_the_outer_loop_and_the_budget_scales_all_schedules(tmp_path: Path):
-    runs = plan(tmp_path, "training.iterations=90", "loss.geometry_iterations=30")
+    runs = plan(tmp_path, "training.iterations=90", "loss.geometry_iterations=30", "loss.kl_warm_up=20")
     assert [(run.row.name, run.settings.training.seed) for run in runs] == [("ours", 0), ("pose_face", 0), ("ours", 1), ("pose_face", 1)]
-    assert {(run.settings.training.iterations, run.settings.loss.geometry_iterations) for run in runs} == {(45, 15)}
+    assert {run.settings.training.iterations for run in runs} == {45}
+    assert {(run.settings.loss.geometry_iterations, run.settings.loss.kl_warm_up) for run in runs} == {(15, 10)}
     assert runs[1].path == tmp_path / "pose_face" / "seed_0"
     assert all(Path(run.settings.capture.path).is_absolute() for run in runs)
 
