@@ -72,6 +72,22 @@ class StatisticsNetwork(nn.Module):
         return LARGEST_SCORE * torch.tanh(score / LARGEST_SCORE)
 
 
+def without_common_shift(z: Float[Tensor, "P Z"]) -> Float[Tensor, "P Z"]:
+    """The same codes, whose gradient does not shift all rows alike.
+
+    Mutual information does not change with a shift, but a network that learns from the last few hundred steps' codes does: an encoder
+    outruns it by moving all its codes away, pays for that in the KL term, and leaves z = 0 far from every code that the decoder has met.
+
+    Args:
+        z: [P, Z]; of a single row nothing would be left of the gradient, so that it stays as it is.
+    """
+    if len(z) < 2 or not z.requires_grad:
+        return z
+    passed = z.view_as(z)
+    passed.register_hook(lambda gradient: gradient - gradient.mean(0))
+    return passed
+
+
 def log_mean_exp(scores: Float[Tensor, "*rows"]) -> Float[Tensor, ""]:
     """log of the mean of exp(scores), without overflow."""
     return torch.logsumexp(scores.flatten(), 0) - math.log(scores.numel())

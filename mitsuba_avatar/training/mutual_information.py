@@ -30,6 +30,7 @@ from mitsuba_avatar.model.disentanglement import (
     log_mean_exp,
     mismatched,
     mutual_information_bound,
+    without_common_shift,
 )
 from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.settings import DisentanglementSettings
@@ -89,12 +90,13 @@ class MutualInformation:
         Args:
             z: [P, Z] codes as the decoder sees them. driving: [P, D] their driving signals.
 
-        Gradients: to z only.
+        Gradients: to z only, less what shifts all codes alike (`without_common_shift`).
         """
         if self.seen < FEWEST_PAIRS or self.running <= 0:
             return 0.0 * z.sum().abs()  # differentiable like what follows
         frozen = {name: value.detach() for name, value in (*self.network.named_parameters(), *self.network.named_buffers())}
         others = self.driving[self._draw(0)]  # [K, D]
+        z = without_common_shift(z)
         joint = functional_call(self.network, frozen, (z, driving.detach()))
         product = functional_call(self.network, frozen, (z[:, None], others[None]))  # [P, K]
         slope = corrected_objective(joint, product, self.mean_exp)

@@ -12,6 +12,7 @@ from mitsuba_avatar.model.disentanglement import (
     log_mean_exp,
     mismatched,
     mutual_information_bound,
+    without_common_shift,
 )
 
 
@@ -91,3 +92,14 @@ def test_the_corrected_gradient_is_the_bounds_own_where_the_average_is_the_batch
     plain = -(batches.softmax(1) * batches).sum(1).mean()
     corrected = -(batches.exp() * batches).mean() / mean_exp
     assert float(corrected) == pytest.approx(float(true), rel=1e-3) and abs(float(plain - true)) > 0.3 * abs(float(true))
+
+
+def test_only_the_gradient_that_shifts_all_rows_is_taken_out():
+    z, wanted = pairs(4)[0].requires_grad_(), pairs(4)[1][:, :3]
+    passed = without_common_shift(z)
+    assert torch.equal(passed, z)
+    (passed * wanted).sum().backward()
+    torch.testing.assert_close(z.grad, wanted - wanted.mean(0))
+    alone = torch.zeros(1, 3, requires_grad=True)
+    (without_common_shift(alone) * wanted[:1]).sum().backward()
+    assert torch.equal(alone.grad, wanted[:1])

@@ -172,6 +172,7 @@ def test_the_gradient_reaches_the_codes_and_nothing_else():
     assert float(penalty.detach()) == pytest.approx(information.estimate)
     penalty.backward()
     assert (z.grad.abs().sum(1) > 0).all() and driving.grad is None
+    assert float(z.grad.sum(0).abs().max()) < 1e-5 * float(z.grad.abs().max()), "codes are not to be shifted away from the network"
     information.optimizer.zero_grad(set_to_none=True)
     information.penalty(z, driving).backward()
     assert all(parameter.grad is None for parameter in information.network.parameters())
