@@ -2,8 +2,8 @@
 
 Prints, and writes to report.json: how much the latent code says and what it tells about the driving signal, what swaps of codes and of
 driving signals move, chance correlations, distances from the true surface, and whether pictures darken where the pose hides light. Draws
-where controls act, where the avatar is unsure, and what inverse rendering gained. Captures given with --drives move the avatar, as its own
-test frames do, with every imputation of its latent code.
+where controls act, where the avatar is unsure, and what training gained on the registered mesh. Captures given with --drives move the
+avatar, as its own test frames do, with every imputation of its latent code.
 """
 
 import json

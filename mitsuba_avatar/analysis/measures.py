@@ -156,7 +156,8 @@ def geometry_errors(study: Study, most: int) -> dict[str, dict[str, float]]:
     """Split -> mean distances in millimetres from the true surface: of the registered mesh that the avatar was trained on, of the surface
     driven with z = 0, and of the surface decoded from the frame's own latent code; each over all vertices and over the garment's alone.
 
-    With tracking noise on the registered mesh, "decoded" below "registered" on training frames is what inverse rendering gained.
+    With tracking noise on the registered mesh, "decoded" below "registered" on training frames is what training gained. Errors of tracking
+    average out over frames without any image: what images add is the difference to the same training without them (a rehearsal).
     """
     masks = {"": np.ones(study.rig.topology.num_vertices, dtype=bool)} | {f"_{name}": mask for name, mask in study.groups().items()}
     errors: dict[str, dict[str, float]] = {}

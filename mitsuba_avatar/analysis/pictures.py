@@ -133,7 +133,7 @@ def save_geometry_gain(path: Path | str, study: Study, painter: FieldPainter) ->
         exact = torch.from_numpy(np.array(study.exact[frame], np.float32))
         for row, name, distance in zip(rows, ("registered", "decoded"), surface_distances(study, frame), strict=True):
             row.append(Painted(f"{name}, frame {frame}: {distance.mean():.2f} mm", distance, exact))
-    painter.save(path, "Distance from the true surface, before and after inverse rendering", "mm", rows)
+    painter.save(path, "Distance from the true surface, before and after training", "mm", rows)
 
 
 def _some(study: Study, count: int, split: str = "test") -> list[int]:
