@@ -95,7 +95,7 @@ def shading_errors(
             pixels.append(_pixels(evaluator, batch, evaluator.draw("avatar", batch), mean))
             done += 1
             progress(done, total)
-        columns = np.concatenate(pixels, axis=1)
+        columns = np.concatenate([np.empty((4, 0)), *pixels], axis=1)
         if columns.size:
             errors[split] = asdict(ShadingError.of(*columns))
     return errors

@@ -51,10 +51,9 @@ def test_an_avatar_that_darkens_too_little_shows_in_the_slope(fitted_run: Path, 
 
         with monkeypatch.context() as patched:
             patched.setattr(type(avatar), "decode", decoded)
-            errors = shading_errors(evaluator, {"train": evaluator.train_frames[:2], "test": [8, 9]})
-        assert set(errors) == {"train", "test"}
+            errors = shading_errors(evaluator, {"validation": [], "test": [8, 9]} if power > 0 else {"test": [8, 9]})
+        assert set(errors) == {"test"}
         return errors["test"]["slope"]
 
-    as_it_is, brighter_where_open, darker_where_open = slope(0.0), slope(0.5), slope(-0.5)
-    assert brighter_where_open < as_it_is - 0.3
-    assert darker_where_open > as_it_is + 0.3
+    brighter_where_open, darker_where_open = slope(0.5), slope(-0.5)
+    assert 0.7 < darker_where_open - brighter_where_open < 1.5  # the two differ by one power of the occlusion
