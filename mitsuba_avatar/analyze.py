@@ -66,12 +66,13 @@ def _analyze(command: AnalyzeCommand) -> int:
     folder = Path(command.out) if command.out else Path(command.run) / "analysis"
     folder.mkdir(parents=True, exist_ok=True)
     check_writable(folder)
-    has_shadow = loaded.run.settings.model.use_shadow
     with StageProgress() as progress:
         progress.update("encoding", 0, 1)
         study = Study.of(loaded.avatar, loaded.run.rig, loaded.capture)
         progress.update("effects of controls", 0, 1)
-        effects = control_effects(study, liveliest_controls(study))
+        occlusion = FrameOcclusion(loaded.occlusion(), loaded.run.rig, loaded.avatar.template_vertices, loaded.capture.theta)
+        occlusion = occlusion if loaded.run.settings.model.use_shadow else None
+        effects = control_effects(study, liveliest_controls(study), occlusion)
         progress.update("disentanglement", 0, 1)
         report = {"disentanglement": disentanglement(study), "geometry": geometry_errors(study, command.frames)}
         progress.update("shading", 0, 1)
@@ -79,18 +80,18 @@ def _analyze(command: AnalyzeCommand) -> int:
         if command.drives:
             report["imputation"] = _imputations(command, loaded, study, progress)
         report["share_outside_region"] = {effect.name: effect.share_outside for effect in effects}
+        report["share_recoloured_outside_region"] = {effect.name: effect.share_recoloured_outside for effect in effects}
         with atomic_path(folder / "report.json") as temporary:
             temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         progress.update("pictures", 0, 3)
         painter = FieldPainter(study)
-        save_effects(folder / "effects.png", study, painter, effects)
+        save_effects(folder / "effects.png", folder / "effects_colour.png", study, painter, effects)
         progress.update("pictures", 1, 3)
         save_geometry_gain(folder / "geometry.png", study, painter)
         progress.update("pictures", 2, 3)
         if study.posterior is not None:
-            occlusion = FrameOcclusion(loaded.occlusion(), loaded.run.rig, loaded.avatar.template_vertices, loaded.capture.theta)
             pictures = folder / "uncertainty_shape.png", folder / "uncertainty_texture.png"
-            save_uncertainty(*pictures, study, painter, occlusion if has_shadow else None)
+            save_uncertainty(*pictures, study, painter, occlusion)
         progress.update("pictures", 3, 3)
     sys.stdout.write(json.dumps(report, indent=2) + "\n")
     sys.stderr.write(f"Report and pictures are in {folder}\n")

@@ -18,7 +18,7 @@ def test_report_and_pictures_are_written(fitted_run: Path, tmp_path: Path, capsy
     report = json.loads((tmp_path / "analysis" / "report.json").read_text())
     assert json.loads(capsys.readouterr().out) == report
     assert report["geometry"]["test"]["driven_mm"] > 0 and 0 <= report["share_outside_region"]["face"] <= 1
-    for name in ("effects", "geometry", "uncertainty_shape", "uncertainty_texture"):
+    for name in ("effects", "effects_colour", "geometry", "uncertainty_shape", "uncertainty_texture"):
         with Image.open(tmp_path / "analysis" / f"{name}.png") as picture:
             assert len(np.unique(np.asarray(picture.convert("L")))) > 10
 

@@ -102,12 +102,20 @@ class FieldPainter:
         return np.concatenate(list(display), axis=1)
 
 
-def save_effects(path: Path | str, study: Study, painter: FieldPainter, effects: Sequence[Effect]) -> None:
-    """The paper's figure on localized effects: where each control moves the surface, and the share outside its region."""
-    rest = study.avatar.template_vertices
-    bodies = [Painted(f"{effect.name}\n{100 * effect.share_outside:.1f} % outside its region", effect.moved_mm, rest) for effect in effects]
-    half = -(-len(bodies) // 2)
-    painter.save(path, "Where a control moves the surface (z = 0)", "mm", [bodies[:half], bodies[half:]])
+def save_effects(shape_path: Path | str, colour_path: Path | str, study: Study, painter: FieldPainter, effects: Sequence[Effect]) -> None:
+    """The paper's figure on localized effects: where each control moves the surface, where it changes colours, and the share outside its
+    region."""
+    rest, half = study.avatar.template_vertices, -(-len(effects) // 2)
+
+    def save(path: Path | str, title: str, unit: str, fields: Sequence[np.ndarray], shares: Sequence[float]) -> None:
+        labels = [f"{effect.name}\n{100 * share:.1f} % outside its region" for effect, share in zip(effects, shares, strict=True)]
+        bodies = [Painted(label, field, rest) for label, field in zip(labels, fields, strict=True)]
+        painter.save(path, title, unit, [bodies[:half], bodies[half:]])
+
+    moved, recoloured = ([getattr(effect, name) for effect in effects] for name in ("moved_mm", "recoloured"))
+    save(shape_path, "Where a control moves the surface (z = 0)", "mm", moved, [effect.share_outside for effect in effects])
+    shares = [effect.share_recoloured_outside for effect in effects]
+    save(colour_path, "Where a control changes colours (z = 0, occlusion held)", "linear radiance", recoloured, shares)
 
 
 def save_uncertainty(

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,16 +12,27 @@ from mitsuba_avatar.analysis.effects import FACE, control_effects, liveliest_con
 from mitsuba_avatar.analysis.measures import Study
 from mitsuba_avatar.analysis.regions import NEAR, with_surroundings
 from mitsuba_avatar.body.driving import driving_regions
+from mitsuba_avatar.body.uv import UvAtlas
 from mitsuba_avatar.loaded_run import LoadedRun
+from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
 
 pytestmark = pytest.mark.usefixtures("one_thread", "private_cache")
 ELBOW = 2
 
 
 @pytest.fixture
-def study(fitted_run: Path) -> Study:
-    loaded = LoadedRun.open(fitted_run)
+def loaded(fitted_run: Path) -> LoadedRun:
+    return LoadedRun.open(fitted_run)
+
+
+@pytest.fixture
+def study(loaded: LoadedRun) -> Study:
     return Study.of(loaded.avatar, loaded.run.rig, loaded.capture)
+
+
+@pytest.fixture
+def occlusion(loaded: LoadedRun) -> FrameOcclusion:
+    return FrameOcclusion(loaded.occlusion(), loaded.run.rig, loaded.avatar.template_vertices, loaded.capture.theta)
 
 
 def test_the_surroundings_of_a_region_are_measured_on_the_body(study: Study):
@@ -32,7 +44,9 @@ def test_the_surroundings_of_a_region_are_measured_on_the_body(study: Study):
     assert gap.max() <= NEAR
 
 
-def test_an_effect_is_as_large_as_the_movement_and_tells_what_lies_outside(study: Study, monkeypatch: pytest.MonkeyPatch):
+def test_an_effect_is_as_large_as_the_change_and_tells_what_lies_outside(
+    study: Study, occlusion: FrameOcclusion, monkeypatch: pytest.MonkeyPatch
+):
     region = with_surroundings(study.rig, driving_regions(study.rig).theta[ELBOW])
     inside, outside = np.flatnonzero(region)[:3], np.flatnonzero(~region)[:1]
     std = study.drive.theta[study.frames("train")][:, ELBOW].std()
@@ -42,10 +56,23 @@ def test_an_effect_is_as_large_as_the_movement_and_tells_what_lies_outside(study
         rest[:, torch.from_numpy(np.concatenate([inside, outside])), 1] += 0.01 * theta[:, [ELBOW]] / (2 * std)
         return rest
 
+    def repainting(theta, root, face, z, centers, occlusion):
+        assert z is None and occlusion.shape[0] == len(theta) == 1
+        maps = colour * float(theta[0, ELBOW] / (2 * std))
+        return SimpleNamespace(textures=maps.expand(1, 1, 3, *maps.shape))
+
+    patch = np.zeros(study.rig.topology.num_vertices, np.float32)
+    patch[np.concatenate([inside, outside])] = 0.4
+    colour = UvAtlas(study.rig.topology, 64).texels_from_vertices(torch.from_numpy(patch)[None, :, None])[0, 0]
     monkeypatch.setattr(study.avatar, "decode_rest_vertices", leaking)
-    elbow, face = control_effects(study, [study.rig.dofs.names[ELBOW], FACE])
+    monkeypatch.setattr(study.avatar, "decode", repainting)
+    elbow, face = control_effects(study, [study.rig.dofs.names[ELBOW], FACE], occlusion)
     assert elbow.moved_mm[inside] == pytest.approx(10.0, rel=1e-3) and elbow.share_outside == pytest.approx(0.25, rel=1e-3)
-    assert face.share_outside == 0 and not face.moved_mm.any()
+    painted = UvAtlas(study.rig.topology, 64).vertices_from_texels(colour[None, None])[0, :, 0].numpy()
+    assert elbow.recoloured == pytest.approx(painted, abs=1e-5) and painted.max() > 0
+    assert elbow.share_recoloured_outside == pytest.approx(painted[~region].sum() / painted.sum(), rel=1e-3)
+    assert 0.05 < elbow.share_recoloured_outside < 0.95
+    assert face.share_outside == face.share_recoloured_outside == 0 and not face.moved_mm.any() and not face.recoloured.any()
 
 
 def test_controls_are_the_angles_that_vary_most_one_a_joint_and_the_face(study: Study):
@@ -53,7 +80,7 @@ def test_controls_are_the_angles_that_vary_most_one_a_joint_and_the_face(study: 
     std = study.drive.theta[study.frames("train")].std(0)
     assert names[0] == study.rig.dofs.names[int(std.argmax())] and names[-1] == FACE and len(names) == 3
     with pytest.raises(ValueError, match="expected names of pose angles or 'face'"):
-        control_effects(study, ["left_wing"])
+        control_effects(study, ["left_wing"], None)
 
 
 def test_spreads_are_those_of_the_decoder(study: Study, monkeypatch: pytest.MonkeyPatch):
