@@ -6,11 +6,8 @@ left out one by one, they would choose a penalty that learns frames by heart.
 Symbols: N rows, A features, X targets, M rows that are asked for.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
 
 PENALTIES = tuple(10.0**power for power in range(-3, 5))  # for features of unit variance
 BLOCKS = 5
@@ -19,28 +16,29 @@ BLOCKS = 5
 def ridge_prediction(
     features: Float[np.ndarray, "N A"], targets: Float[np.ndarray, "N X"], asked: Float[np.ndarray, "M A"]
 ) -> Float[np.ndarray, "M X"]:
-    """Predict targets, linearly and without an intercept: centre both before. Solved over rows, because they are fewer than targets.
+    """Predict targets, linearly and without an intercept: centre both before.
 
     Args:
         features: of unit variance, or nearly.
         targets: in any unit.
         asked: features of the rows to predict.
     """
-    gram = features @ features.T
     rows = np.arange(len(features))
-    blocks = np.array_split(rows, min(BLOCKS, len(rows)))
-
-    def loss(penalty: float) -> float:
-        total = 0.0
-        for block in blocks:
-            rest = np.setdiff1d(rows, block)
-            predicted = _solve(gram[np.ix_(rest, rest)], targets[rest], penalty)(gram[np.ix_(block, rest)])
-            total += float(np.square(predicted - targets[block]).sum())
-        return total
-
-    return _solve(gram, targets, min(PENALTIES, key=loss))(asked @ features.T)
+    losses = np.zeros(len(PENALTIES))
+    for block in np.array_split(rows, min(BLOCKS, len(rows))):
+        rest = np.setdiff1d(rows, block)
+        solved = _Solved(features[rest], targets[rest])
+        losses += [float(np.square(solved.predict(features[block], penalty) - targets[block]).sum()) for penalty in PENALTIES]
+    return _Solved(features, targets).predict(asked, PENALTIES[int(np.argmin(losses))])
 
 
-def _solve(gram: np.ndarray, targets: np.ndarray, penalty: float) -> Callable[[np.ndarray], np.ndarray]:
-    coefficients = cho_solve(cho_factor(gram + penalty * np.eye(len(gram))), targets)
-    return lambda cross: cross @ coefficients
+class _Solved:
+    """The singular value decomposition of the features, which serves every penalty."""
+
+    def __init__(self, features: np.ndarray, targets: np.ndarray):
+        left, self.values, self.directions = np.linalg.svd(features, full_matrices=False)
+        self.projected = left.T @ targets
+
+    def predict(self, asked: np.ndarray, penalty: float) -> np.ndarray:
+        shrunk = self.values / (self.values**2 + penalty)
+        return (asked @ self.directions.T * shrunk) @ self.projected

@@ -54,7 +54,7 @@ def test_a_folder_of_other_settings_is_refused_with_what_differs(tmp_path: Path)
     run.path.mkdir(parents=True)
     save_settings(run.path / "settings.yaml", run.settings)
     plan(tmp_path)
-    with pytest.raises(ValueError, match=r"loss.kl 0.0005 -> 0.5. Name another folder with --out."):
+    with pytest.raises(ValueError, match=rf"loss.kl {run.settings.loss.kl} -> 0.5. Name another folder with --out."):
         plan(tmp_path, "loss.kl=0.5")
 
 
