@@ -147,7 +147,8 @@ class MutualInformation:
         self.seen, self.mean_exp, self.running = state["numbers"]
 
     def _judge(self, posterior: Posterior, driving: Tensor) -> None:
-        """Average the bound of pairs that the network has not seen into the running estimate."""
+        """Average the bound of the newest batch, drawn anew, into the running estimate. After the first pass over a capture the network has
+        learnt from the same frames before, so that the estimate rises above the truth where codes tell frames apart."""
         z = self._sample(posterior, 0)
         with torch.no_grad():
             bound = mutual_information_bound(self.network(z, driving), self.network(z[:, None], self.driving[self._draw(0)][None]))
