@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.presets import resolve
 from mitsuba_avatar.progress import StageProgress, progress_bar, tracked
 from mitsuba_avatar.rendering.ambient_occlusion import AmbientOcclusion, FrameOcclusion
+from mitsuba_avatar.rendering.occlusion_ahead import OcclusionAhead
 from mitsuba_avatar.rendering.surface import SurfaceRenderer
 from mitsuba_avatar.reporting.camera_paths import orbit
 from mitsuba_avatar.reporting.evaluation import Evaluator
@@ -47,6 +49,7 @@ from mitsuba_avatar.training.statistics import evenly_spaced, training_statistic
 
 LOG_EVERY = 10  # iterations between lines of metrics.jsonl
 VALIDATION_FRAMES = 4
+BAKED_AT_ONCE = 300  # missing maps of occlusion, which take about as long as the process that bakes more of them takes to start
 
 
 def open_capture(settings: Settings, process: Process = Process()) -> Capture:  # noqa: B008 - frozen
@@ -80,6 +83,7 @@ class Fit:
         self.settings, self.run, self.trainer, self.process = settings, run, trainer, process
         self.reader, self.avatar = trainer.reader, trainer.avatar
         self.occlusion = occlusion
+        self._ahead: OcclusionAhead | None = None
         self.capture = self.reader.capture
 
     @staticmethod
@@ -113,14 +117,27 @@ class Fit:
                 run = RunFolder(path, settings, rig, capture.path, face_size)
         avatar = avatar.to("cuda" if is_on_gpu else "cpu")
         occlusion = frame_occlusion(settings, rig, avatar, capture)
-        if settings.loss.looks_at_images:
-            with progress_bar("ambient occlusion", len(capture.frames), is_shown=process.is_main) as bar:
-                occlusion.bake(bar.update)
         reader = FrameReader(capture, occlusion)
         trainer = Trainer(avatar, rig, reader, settings, process)
         if is_resumed:
             trainer.resume(run.checkpoints)
-        return Fit(settings, run, trainer, occlusion, process)
+        fit = Fit(settings, run, trainer, occlusion, process)
+        if settings.loss.looks_at_images:
+            fit.bake_occlusion()
+        return fit
+
+    def bake_occlusion(self) -> None:
+        """Few missing maps at once, many beside the training, in the order in which it wants them; then those of other splits."""
+        count = len(self.capture.frames)
+        missing = sum(not self.occlusion.is_baked(frame) for frame in range(count))
+        if missing <= BAKED_AT_ONCE:
+            with progress_bar("ambient occlusion", count, is_shown=self.process.is_main) as bar:
+                self.occlusion.bake(bar.update)
+            return
+        if self.process.is_main:
+            sys.stderr.write(f"{missing} maps of ambient occlusion are baked by a process of their own, beside the first steps.\n")
+        coming = self.trainer.sampler.coming_frames(self.trainer.iteration, self.settings.training.iterations)
+        self.reader.occlusion = self._ahead = OcclusionAhead(self.occlusion, chain(coming, range(count)))
 
     def train(self) -> bool:
         """Train to the end; False if the user stopped it, with everything saved.
@@ -201,7 +218,9 @@ class Fit:
         sys.stderr.write(terminal_table(metrics.means()) + "\n")
 
     def leave(self) -> None:
-        """Disconnect from the other ranks, if any."""
+        """Disconnect from the other ranks, if any, and end what still bakes for this one."""
+        if self._ahead is not None:
+            self._ahead.close()
         leave_processes(self.process)
 
     def _tools(self, samples_per_pixel: int) -> tuple[Evaluator, Presentation]:

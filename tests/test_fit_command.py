@@ -139,6 +139,20 @@ def test_a_new_run_takes_a_free_name(tmp_path, private_cache, drawn_capture, mon
     assert (tmp_path / "runs/tiny-2/metrics.json").exists() and not any((tmp_path / "runs/tiny").iterdir())
 
 
+def test_occlusion_of_many_frames_is_baked_beside_the_training(tmp_path, drawn_capture, monkeypatch, capsys):
+    """As many maps as without, in the same bytes, and the same losses; and no map is baked by the trainer."""
+    losses, maps = [], []
+    for at_once, name in ((10_000, "before"), (5, "beside")):
+        monkeypatch.setattr("mitsuba_avatar.fitting.BAKED_AT_ONCE", at_once)
+        monkeypatch.setenv("MITSUBA_AVATAR_CACHE", str(tmp_path / name))
+        assert fit(drawn_capture.path, tmp_path / f"{name}_run", *SHORTEST_FIT) == 0
+        assert ("by a process of their own" in capsys.readouterr().err) == (name == "beside")
+        losses.append(read_records(tmp_path / f"{name}_run/metrics.jsonl")[-1]["image"])
+        maps.append({path.name: path.read_bytes() for path in (tmp_path / name).rglob("*.npy")})
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    assert maps[1].items() <= maps[0].items() and len(maps[1]) >= 5
+
+
 # ---- interrupting and resuming
 
 

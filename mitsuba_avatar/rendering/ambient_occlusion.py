@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from mitsuba_avatar.body.mesh import vertex_normals
@@ -164,7 +164,7 @@ class FrameOcclusion:
         theta: Float[np.ndarray, "N D"],
         folder: Path | None = None,
     ):
-        self.occlusion, self.theta = occlusion, theta
+        self.occlusion, self.rig, self.theta = occlusion, rig, theta
         self.template_vertices = template_vertices.detach().cpu()
         self.skeleton = Skeleton(rig)
         self.skinning_weights = torch.from_numpy(rig.skinning_weights)
@@ -177,9 +177,23 @@ class FrameOcclusion:
     def bake(self, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
         """Bake what is not on disk yet; `progress(done, total)` is called after every frame."""
         for frame in range(len(self.theta)):
-            if not self._path(frame).exists():
-                self._bake(frame)
+            self.prepare(frame)
             progress(frame + 1, len(self.theta))
+
+    def prepare(self, frame: int) -> None:
+        """Bake a frame's map if it is not on disk yet."""
+        if not self.is_baked(frame):
+            self._bake(frame)
+
+    def is_baked(self, frame: int) -> bool:
+        """Whether a frame's map is on disk."""
+        return self._path(frame).exists()
+
+    def recipe(self) -> "OcclusionRecipe":
+        """What another process needs to bake the same maps into the same folder."""
+        baker = self.occlusion
+        theta = np.array(self.theta, np.float32)
+        return OcclusionRecipe(self.rig, baker.size, baker.rays, baker.distance, self.template_vertices.numpy(), theta, self.folder.parent)
 
     def maps(self, frames: list[int]) -> Float[Tensor, "P 1 S S"]:
         """Occlusion of the given rows of theta, [P, 1, S, S]; what is not on disk yet is baked."""
@@ -192,8 +206,7 @@ class FrameOcclusion:
         return hashlib.sha256(np.ascontiguousarray(self.theta[frame], np.float32).tobytes()).hexdigest()
 
     def _read(self, frame: int) -> UInt8[np.ndarray, "S S"]:
-        path = self._path(frame)
-        return np.load(path) if path.exists() else self._bake(frame)
+        return np.load(self._path(frame)) if self.is_baked(frame) else self._bake(frame)
 
     def _bake(self, frame: int) -> UInt8[np.ndarray, "S S"]:
         angles = torch.from_numpy(np.array(self.theta[frame], np.float32))
@@ -205,3 +218,21 @@ class FrameOcclusion:
         with atomic_path(self._path(frame)) as temporary:
             np.save(temporary, stored)
         return stored
+
+
+@dataclass(frozen=True)
+class OcclusionRecipe:
+    """A `FrameOcclusion` that can be sent to another process: arguments of it and of its baker."""
+
+    rig: Rig
+    size: int
+    rays: int
+    distance: float
+    template_vertices: Float32[np.ndarray, "V 3"]
+    theta: Float32[np.ndarray, "N D"]
+    folder: Path
+
+    def frames(self) -> FrameOcclusion:
+        """The sequence, with a baker of this process."""
+        baker = AmbientOcclusion(self.rig.topology, self.size, self.rays, self.distance)
+        return FrameOcclusion(baker, self.rig, torch.from_numpy(self.template_vertices), self.theta, self.folder)

@@ -23,6 +23,7 @@ from mitsuba_avatar.captures.colour import encode
 from mitsuba_avatar.captures.folder import CAMERAS_FILE, Capture
 from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
+from mitsuba_avatar.rendering.occlusion_ahead import OcclusionAhead
 from mitsuba_avatar.settings import TrainingSettings
 from mitsuba_avatar.training.distributed import Process
 
@@ -106,7 +107,7 @@ class FrameReader:
         FileNotFoundError, ValueError: the capture cannot be read as batches; see `check_readable`.
     """
 
-    def __init__(self, capture: Capture, occlusion: FrameOcclusion):
+    def __init__(self, capture: Capture, occlusion: FrameOcclusion | OcclusionAhead):
         check_readable(capture)
         self.capture, self.occlusion = capture, occlusion
         self.width, self.height = film_size(capture.cameras.values())
@@ -222,6 +223,11 @@ class BatchSampler:
         share = self.poses // self.num_ranks
         own = slice(self.rank * share, (self.rank + 1) * share)
         return frames[own], names[own]
+
+    def coming_frames(self, start: int, stop: int) -> Iterator[int]:
+        """Frames of iterations start..stop-1 in the order of this rank's batches, for one pass over the capture at most."""
+        for iteration in range(start, min(stop, start + -(-len(self.frames) // self.poses))):
+            yield from self.draw(iteration)[0]
 
 
 def training_sampler(capture: Capture, training: TrainingSettings, process: Process) -> BatchSampler:

@@ -37,6 +37,13 @@ def test_every_epoch_shows_every_frame_once_in_another_order():
     assert drawn[:7] != drawn[7:]
 
 
+def test_coming_frames_are_those_of_the_next_batches_for_one_pass_at_most():
+    sampler = make_sampler(frames=7, poses=4, rank=1, num_ranks=2)
+    drawn = [frame for i in (5, 6) for frame in sampler.draw(i)[0]]
+    assert list(sampler.coming_frames(5, 100)) == drawn  # two batches of four hold seven frames
+    assert list(sampler.coming_frames(5, 6)) == drawn[:2]
+
+
 def test_cameras_of_a_pose_are_all_different_and_all_get_their_turn():
     names = [group for i in range(20) for group in make_sampler().draw(i)[1]]
     assert all(len(set(group)) == 3 for group in names)
