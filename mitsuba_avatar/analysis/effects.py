@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mitsuba_avatar.analysis.measures import AT_ONCE, MILLIMETRES, Study
+from mitsuba_avatar.analysis.measures import AT_ONCE, Study
 from mitsuba_avatar.analysis.regions import with_surroundings
 from mitsuba_avatar.body.driving import driving_regions
 from mitsuba_avatar.body.uv import UvAtlas
@@ -25,6 +25,7 @@ from mitsuba_avatar.driving.principal_directions import PrincipalDirections
 from mitsuba_avatar.driving.uncertainty import prior_codes, shape_spread, texture_spread
 from mitsuba_avatar.rendering.ambient_occlusion import FrameOcclusion
 from mitsuba_avatar.rendering.cameras import CameraBatch
+from mitsuba_avatar.reporting.disentanglement import MILLIMETRES
 from mitsuba_avatar.training.statistics import evenly_spaced
 
 FACE = "face"

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mitsuba_avatar.analysis.measures import MILLIMETRES, Study
+from mitsuba_avatar.analysis.measures import Study
 from mitsuba_avatar.body.skinning import pose_vertices
 from mitsuba_avatar.driving.assembly import AssembledDrive, assemble, trained_face
 from mitsuba_avatar.driving.imputation import ImputationName, make_imputation
@@ -24,6 +24,7 @@ from mitsuba_avatar.driving.temporal_model import TemporalModel
 from mitsuba_avatar.driving.training_latents import TrainingLatents
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.model.keypoints import DrivenKeypoints
+from mitsuba_avatar.reporting.disentanglement import MILLIMETRES
 from mitsuba_avatar.training.run_folder import RunFolder
 
 AT_ONCE = 8  # frames

@@ -18,11 +18,13 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.captures.arrays import open_frame_array
 from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.driving.signals import DrivingSignals
+from mitsuba_avatar.driving.training_latents import encode_frames
 from mitsuba_avatar.filming.truth import GARMENT, TRUTH_FOLDER
 from mitsuba_avatar.model.avatar import Avatar
 from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.model.keypoints import DrivenKeypoints, lists_face_landmarks
 from mitsuba_avatar.reporting.disentanglement import (
+    MILLIMETRES,
     drive_swap,
     fresh_mutual_information,
     latent_swap,
@@ -35,7 +37,6 @@ from mitsuba_avatar.reporting.metrics import l1_in_mask, mse_in_mask, psnr_from_
 from mitsuba_avatar.ridge import ridge_prediction
 from mitsuba_avatar.training.statistics import evenly_spaced
 
-MILLIMETRES = 1000.0  # in a metre
 AT_ONCE = 8  # frames
 PRINCIPAL = 64  # directions of the garment's shape that the hidden state is told in
 STEADY = 1e-4  # radians: an angle that varies less tells nothing
@@ -121,7 +122,10 @@ class Study:
         exact = open_frame_array(truth, "vertices", count) if truth.is_dir() else None
         garment = np.load(truth / GARMENT) if (truth / GARMENT).is_file() else None
         drive = DrivingSignals.of_capture(capture)
-        return cls(avatar, rig, capture, drive, _encoded(avatar, capture, drive), capture.vertices if exact is None else exact, garment)
+        posterior = None
+        if avatar.settings.use_latent and capture.vertices is not None:
+            posterior = encode_frames(avatar, capture, list(range(count)), drive)
+        return cls(avatar, rig, capture, drive, posterior, capture.vertices if exact is None else exact, garment)
 
     def frames(self, *splits: str) -> list[int]:
         """Frames of some splits, in order of time, without stress segments."""
@@ -264,19 +268,6 @@ def _hidden_state(study: Study, train: list[int]) -> Float[np.ndarray, "N K"]:
     moving = spread > STEADY
     angles = (angles - mean)[:, moving] / spread[moving]
     return state - ridge_prediction(angles[train], state[train], angles)
-
-
-@torch.no_grad()
-def _encoded(avatar: Avatar, capture: Capture, drive: DrivingSignals) -> Posterior | None:
-    """Posterior of every frame of a capture."""
-    if not avatar.settings.use_latent or capture.vertices is None:
-        return None
-    parts = []
-    for start in range(0, len(capture.frames), AT_ONCE):
-        rows = slice(start, start + AT_ONCE)
-        registered = torch.from_numpy(np.array(capture.vertices[rows], np.float32))
-        parts.append(avatar.encode(avatar.unpose(registered, drive.theta[rows], drive.root[rows])))
-    return Posterior(torch.cat([part.mu for part in parts]), torch.cat([part.logvar for part in parts]))
 
 
 def _distance(study: Study, frame: int, surface: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:  # noqa: F821

@@ -22,6 +22,7 @@ from mitsuba_avatar.captures.folder import Capture
 from mitsuba_avatar.driving.signals import DrivingSignals
 from mitsuba_avatar.files import atomic_path
 from mitsuba_avatar.model.avatar import Avatar
+from mitsuba_avatar.model.encoder import Posterior
 from mitsuba_avatar.training.run_folder import RunFolder
 
 ENCODED_AT_ONCE = 8  # frames
@@ -62,16 +63,8 @@ class TrainingLatents:
                 f"TrainingLatents.encode(): expected registered meshes in {capture.path / 'vertices.npy'}; got none. "
                 "Impute with zero or prior, which need no encoder."
             )
-        device, mu, logvar = avatar.mean_texture.device, [], []
-        for start in range(0, len(frames), ENCODED_AT_ONCE):
-            rows = slice(start, min(start + ENCODED_AT_ONCE, len(frames)))
-            vertices = torch.from_numpy(np.stack([capture.vertices[frame] for frame in frames[rows]]).astype(np.float32))
-            unposed = avatar.unpose(vertices.to(device), signals.theta[rows].to(device), signals.root[rows].to(device))
-            posterior = avatar.encode(unposed)
-            mu.append(posterior.mu.cpu())
-            logvar.append(posterior.logvar.cpu())
-            progress(rows.stop, len(frames))
-        return TrainingLatents(torch.cat(mu), torch.cat(logvar), signals)
+        posterior = encode_frames(avatar, capture, frames, signals, progress)
+        return TrainingLatents(posterior.mu, posterior.logvar, signals)
 
     def save(self, path: Path) -> None:
         """Write as one `.npz`, whole or not at all."""
@@ -103,6 +96,33 @@ class TrainingLatents:
         except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
             raise ValueError(f"TrainingLatents.load(): expected whole latents in {path}; got: {error}. Delete the file.") from error
         return TrainingLatents(tensors["mu"], tensors["logvar"], signals)
+
+
+@torch.no_grad()
+def encode_frames(
+    avatar: Avatar,
+    capture: Capture,
+    frames: list[int],
+    signals: DrivingSignals,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Posterior:
+    """What the encoder says about the registered meshes of some frames, on the host.
+
+    Args:
+        avatar: with a latent code.
+        capture: with registered meshes.
+        frames: N of its rows.
+        signals: that drive these N frames.
+        progress: called as progress(done, total).
+    """
+    device, parts = avatar.mean_texture.device, []
+    for start in range(0, len(frames), ENCODED_AT_ONCE):
+        rows = slice(start, min(start + ENCODED_AT_ONCE, len(frames)))
+        vertices = torch.from_numpy(np.stack([capture.vertices[frame] for frame in frames[rows]]).astype(np.float32))
+        unposed = avatar.unpose(vertices.to(device), signals.theta[rows].to(device), signals.root[rows].to(device))
+        parts.append(avatar.encode(unposed))
+        progress(rows.stop, len(frames))
+    return Posterior(torch.cat([part.mu for part in parts]).cpu(), torch.cat([part.logvar for part in parts]).cpu())
 
 
 def latents_path(run: RunFolder, kind: str, checkpoint: str) -> Path:

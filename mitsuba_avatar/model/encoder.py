@@ -43,6 +43,10 @@ class Posterior:
         """Reparameterised draw z = mu + std * noise; noise is drawn by the caller, who owns the seeds. Gradients: to mu and logvar."""
         return self.mu + torch.exp(0.5 * self.logvar) * noise
 
+    def divergence(self) -> Float[Tensor, "P"]:  # noqa: F821
+        """[P] Kullback-Leibler divergence from N(0, I) of each row, nats. Gradients: to mu and logvar."""
+        return 0.5 * (self.mu.square() + self.logvar.exp() - 1 - self.logvar).sum(-1)
+
 
 class Encoder(nn.Module):
     """Strided convolutions over the map of offsets, halving it once per entry of `encoder_channels`, then one scaled linear layer."""

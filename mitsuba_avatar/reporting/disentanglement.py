@@ -75,7 +75,7 @@ def latent_use(posterior: Posterior, seed: int = 0) -> LatentUse:
         seed: of the codes drawn for `frame_information_nats`.
     """
     mu, logvar = posterior.mu.double(), posterior.logvar.double()
-    nats = 0.5 * (mu.square() + logvar.exp() - 1 - logvar).sum(1).mean()
+    nats = Posterior(mu, logvar).divergence().mean()
     active = (mu.var(0, correction=0) > ACTIVE_VARIANCE).sum()
     return LatentUse(float(nats), _frame_information(mu, logvar, seed), int(active))
 

@@ -71,8 +71,7 @@ def laplacian_loss(vertices: Float[Tensor, "P V 3"], tracked_vertices: Float[Ten
 
 def kl_loss(posterior: Posterior) -> Tensor:
     """Kullback-Leibler divergence of the posterior from N(0, I), nats per pose (L_KL). Gradients: to mu and logvar."""
-    mu, logvar = posterior.mu, posterior.logvar
-    return 0.5 * (mu.square() + logvar.exp() - 1 - logvar).sum(-1).mean()
+    return posterior.divergence().mean()
 
 
 def perturbation_loss(keypoints: Float[Tensor, "P K 3"], driven_keypoints: Float[Tensor, "P K 3"]) -> Tensor:
