@@ -49,7 +49,7 @@ from mitsuba_avatar.training.statistics import evenly_spaced, training_statistic
 
 LOG_EVERY = 10  # iterations between lines of metrics.jsonl
 VALIDATION_FRAMES = 4
-BAKED_AT_ONCE = 300  # missing maps of occlusion, which take about as long as the process that bakes more of them takes to start
+BAKED_AT_ONCE = 300  # missing maps of occlusion: some seconds of work, for which no process is started
 
 
 def open_capture(settings: Settings, process: Process = Process()) -> Capture:  # noqa: B008 - frozen

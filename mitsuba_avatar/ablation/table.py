@@ -50,6 +50,8 @@ class Entry:
     row: Row
     errors: dict[str, Spread]
     excesses: tuple[float, ...]  # per cent that the test error is above that of ours with the same seed; none for ours itself
+    takes: dict[str, Spread]  # test take -> its error; empty where a run does not tell
+    take_excesses: tuple[float, ...]  # as `excesses`, but means over takes of the excess in each: a hard take counts as much as an easy one
     latent: tuple[Spread | None, ...]  # LATENT_FIGURES
     seeds: int  # that are measured
     minutes: float | None  # of training, mean over seeds; None where a run does not tell
@@ -68,12 +70,13 @@ def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
     for run in runs:
         if run.is_measured:
             measures.setdefault(run.row, []).append(run.measures())
-    ours = {one["seed"]: driven_errors(one).get("test") for row, ones in measures.items() if row.name == REFERENCE for one in ones}
+    references = {one["seed"]: one for row, ones in measures.items() if row.name == REFERENCE for one in ones}
+    ours = {seed: driven_errors(one).get("test") for seed, one in references.items()}
     for row in dict.fromkeys(run.row for run in runs):
         measured = measures.get(row, [])
         if not measured:
             continue
-        errors = [driven_errors(one) for one in measured]
+        errors, takes = [driven_errors(one) for one in measured], [_takes(one) for one in measured]
         parts = [one.get("disentanglement", {}) for one in measured]
         minutes = [_scaled(one, "training_seconds", 60) for one in measured]
         pairs = [(error["test"], ours[one["seed"]]) for error, one in zip(errors, measured, strict=True) if ours.get(one["seed"])]
@@ -82,6 +85,10 @@ def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
                 row,
                 {split: Spread.of([one[split] for one in errors]) for split in errors[0]},
                 tuple(100 * (test / reference - 1) for test, reference in pairs) if row.name != REFERENCE else (),
+                {name: Spread.of([one[name] for one in takes]) for name in takes[0]}
+                if all(one.keys() == takes[0].keys() for one in takes)
+                else {},
+                _take_excesses(measured, references) if row.name != REFERENCE else (),
                 tuple(_spread(parts, name) for name in LATENT_FIGURES),
                 len(measured),
                 None if None in minutes else float(np.mean(minutes)),
@@ -97,6 +104,31 @@ def driven_errors(measures: dict) -> dict[str, float]:
     if "images" in measures:
         return {split: values["mse"] for split, values in measures["images"].items()}
     return {split: values.get("driven_garment_mm", values["driven_mm"]) for split, values in measures["geometry"].items()}
+
+
+def _takes(measures: dict) -> dict[str, float]:
+    """Test take -> error, of runs that were measured take by take."""
+    return measures.get("images", {}).get("test", {}).get("takes", {})
+
+
+def _take_excesses(measured: Sequence[dict], references: dict[int, dict]) -> tuple[float, ...]:
+    """For each seed that ours has, too: the mean over takes of the per cent by which the error is above that of ours in the same take."""
+    pairs = [(_takes(one), _takes(references[one["seed"]])) for one in measured if one["seed"] in references]
+    return tuple(
+        float(np.mean([100 * (row[name] / ours[name] - 1) for name in row])) for row, ours in pairs if row and row.keys() == ours.keys()
+    )
+
+
+def takes_markdown(entries: Sequence[Entry]) -> str:
+    """Test errors take by take, as Markdown; empty where no row tells them. In "over ours" every take counts alike, unlike in the table."""
+    names = list(dict.fromkeys(name for entry in entries for name in entry.takes))
+    if not names:
+        return ""
+    lines = [["model", *names, "over ours, mean over takes"], ["---"] * (len(names) + 2)]
+    for entry in entries:
+        cells = [entry.takes[name].text(decimals=1) if name in entry.takes else "-" for name in names]
+        lines.append([entry.row.title, *cells, _excess(entry.take_excesses, " ± ", "%")])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
 def markdown(entries: Sequence[Entry]) -> str:
@@ -141,7 +173,8 @@ def write_tables(folder: Path, runs: Sequence[PlannedRun]) -> list[Entry]:
                 "thousand_parameters": _scaled(measures, "parameters", 1000),
             }
             rows.append({"name": run.row.name, "seed": measures["seed"], **errors, **costs, "measures": measures})
-    texts = {"table.md": markdown(entries), "table.tex": latex(entries), "table.json": json.dumps(rows, indent=1) + "\n"}
+    tables = "\n".join(text for text in (markdown(entries), takes_markdown(entries)) if text)
+    texts = {"table.md": tables, "table.tex": latex(entries), "table.json": json.dumps(rows, indent=1) + "\n"}
     for name, text in texts.items():
         with atomic_path(folder / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
@@ -162,14 +195,18 @@ def _cells(entry: Entry, entries: Sequence[Entry], bold: str, between: str, perc
     def optional(value: Spread | None, decimals: int) -> str:
         return "-" if value is None else value.text(between, decimals)
 
-    excess = "-"
-    if entry.excesses:
-        worse = sum(value > 0 for value in entry.excesses)
-        excess = f"{Spread.of(entry.excesses).text(between, 0)} {percent} ({worse} of {len(entry.excesses)})"
+    excess = _excess(entry.excesses, between, percent)
     gap = "-" if entry.gap is None else f"{entry.gap:.2f}"
     published = ["-", "-"] if entry.row.published is None else [f"{value:.3f}" for value in entry.row.published]
     latent = [optional(value, decimals) for value, decimals in zip(entry.latent, LATENT_DECIMALS, strict=True)]
     return [entry.row.title, error("train"), error("validation"), error("test"), excess, gap, *latent, *published]
+
+
+def _excess(values: Sequence[float], between: str, percent: str) -> str:
+    """Mean and deviation of per cents over seeds, and in how many seeds they are positive."""
+    if not values:
+        return "-"
+    return f"{Spread.of(values).text(between, 0)} {percent} ({sum(value > 0 for value in values)} of {len(values)})"
 
 
 def _cost_cells(entry: Entry, entries: Sequence[Entry]) -> list[str]:

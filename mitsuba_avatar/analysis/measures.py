@@ -6,6 +6,7 @@ Truth is read where the capture is the studio's own (its folder `truth/`), and l
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,18 +60,19 @@ class Splits:
         return cls({name: evenly_spaced(frames, most) for name, frames in groups.items() if frames})
 
 
-def image_errors(evaluator: Evaluator, splits: Splits, progress: Progress = lambda done, total: None) -> dict[str, dict[str, float]]:
+def image_errors(evaluator: Evaluator, splits: Splits, progress: Progress = lambda done, total: None) -> dict[str, dict[str, Any]]:
     """Split -> errors of the avatar driven with z = 0, over all cameras and over held-out cameras alone.
 
     Returns:
-        for each split `mse`, `l1` (0..255), `psnr` (of the mean error, dB), `iou`, `held_out_mse`, and `pictures`, how many were counted.
+        for each split `mse`, `l1` (0..255), `psnr` (of the mean error, dB), `iou`, `held_out_mse`, `pictures`, how many were counted, and
+        `takes`: segment -> `mse` of its frames.
     """
     capture = evaluator.capture
     names, held_out = capture.camera_names(), set(capture.camera_names(held_out=True))
     total, done = sum(map(len, splits.frames.values())), 0
     errors = {}
     for split, frames in splits.frames.items():
-        rows = []
+        rows, takes = [], []
         for frame in frames:
             batch = evaluator.reader.read([frame], [names])
             drawn = evaluator.draw("avatar", batch)
@@ -80,6 +82,7 @@ def image_errors(evaluator: Evaluator, splits: Splits, progress: Progress = lamb
                 if inside.any():
                     iou = silhouette_iou(mask, inside)
                     rows.append((mse_in_mask(image, captured, inside), l1_in_mask(image, captured, inside), iou, name in held_out))
+                    takes.append(capture.frames[frame].segment)
             done += 1
             progress(done, total)
         mse, l1, iou, is_held_out = np.array(rows, dtype=np.float64).T
@@ -89,6 +92,7 @@ def image_errors(evaluator: Evaluator, splits: Splits, progress: Progress = lamb
             "psnr": psnr_from_mse(float(mse.mean())),
             "iou": float(iou.mean()),
             "pictures": len(rows),
+            "takes": {take: float(mse[np.array(takes) == take].mean()) for take in dict.fromkeys(takes)},
         }
         if is_held_out.any():
             errors[split]["held_out_mse"] = float(mse[is_held_out > 0].mean())

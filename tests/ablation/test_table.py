@@ -7,7 +7,7 @@ import pytest
 
 from mitsuba_avatar.ablation.plan import PlannedRun
 from mitsuba_avatar.ablation.rows import choose_rows
-from mitsuba_avatar.ablation.table import driven_errors, latex, markdown, summarize, write_tables
+from mitsuba_avatar.ablation.table import driven_errors, latex, markdown, summarize, takes_markdown, write_tables
 from mitsuba_avatar.presets import resolve
 
 ERRORS = {("ours", 0): (12.0, 15.0), ("ours", 1): (12.5, 16.0), ("pose_face", 0): (7.0, 17.0), ("pose_face", 1): (9.0, 18.0)}
@@ -69,6 +69,24 @@ def test_rows_are_compared_with_ours_of_the_same_seed_alone(runs: list[PlannedRu
     text = markdown(summarize([runs[0], runs[2], runs[3]]))
     assert "| 17.50 ± 0.71 | 13 % (1 of 1) |" in text
     assert "%" not in markdown(summarize(runs[2:]))
+
+
+def test_takes_count_alike_whatever_their_error(runs: list[PlannedRun], tmp_path: Path):
+    """A take of ten times the error, where the row is better than ours, outweighs the other take in the mean and not in the takes' mean."""
+    assert takes_markdown(summarize(runs)) == ""
+    takes = {("ours", 0): (10.0, 100.0), ("ours", 1): (20.0, 100.0), ("pose_face", 0): (12.0, 95.0), ("pose_face", 1): (22.0, 98.0)}
+    for run in runs:
+        measures = run.measures()
+        calm, hard = takes[measures["name"], measures["seed"]]
+        measures["images"]["test"] = {"mse": (calm + hard) / 2, "takes": {"calm": calm, "hard": hard}}
+        run.save_measures(measures)
+    heading, rule, ours, pose_face = takes_markdown(summarize(runs)).splitlines()
+    assert heading == "| model | calm | hard | over ours, mean over takes |" and rule.count("---") == 4
+    assert ours == "| ours | 15.0 ± 7.1 | 100.0 ± 0.0 | - |"
+    assert pose_face == "| pose+face | 17.0 ± 7.1 | 96.5 ± 2.1 | 6 ± 2 % (2 of 2) |"  # (20 - 5) / 2 and (10 - 2) / 2
+    assert "| -1 ± 2 % (0 of 2) |" in markdown(summarize(runs))
+    write_tables(tmp_path, runs)
+    assert (tmp_path / "table.md").read_text().count("| ours |") == 2
 
 
 def test_latex_is_a_booktabs_tabular_of_as_many_columns(runs: list[PlannedRun]):

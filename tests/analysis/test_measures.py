@@ -60,6 +60,23 @@ def test_image_errors_are_those_of_the_evaluation(loaded: LoadedRun):
     assert errors["psnr"] == pytest.approx(psnr_from_mse(mse)) and errors["pictures"] == 10
 
 
+def test_image_errors_of_a_split_are_the_mean_of_its_takes(loaded: LoadedRun):
+    """Two frames of one take and one of another, five cameras each."""
+    evaluator = loaded.evaluator()
+    frames = evaluator.capture.frames
+    renamed = tuple(dataclasses.replace(frame, segment="b" if i == 8 else "a") for i, frame in enumerate(frames))
+    evaluator.capture.frames = renamed
+    try:
+        errors = image_errors(evaluator, Splits({"test": [8, 9], "train": [0, 3]}))
+        alone = image_errors(evaluator, Splits({"one": [8]}))["one"]["mse"]
+    finally:
+        evaluator.capture.frames = frames
+    takes = errors["test"]["takes"]
+    assert set(takes) == {"a", "b"} and set(errors["train"]["takes"]) == {"a"}
+    assert errors["test"]["mse"] == pytest.approx((takes["a"] + takes["b"]) / 2) and takes["b"] == pytest.approx(alone)
+    assert abs(takes["a"] / takes["b"] - 1) > 0.01
+
+
 @pytest.fixture
 def constructed(loaded: LoadedRun, monkeypatch: pytest.MonkeyPatch) -> Study:
     """Clothes that move by (1 + face[0]) z[HIDDEN] along x and theta[2] along y, in centimetres; nothing else moves. 108 frames.
