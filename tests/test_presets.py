@@ -179,7 +179,7 @@ def test_a_fault_of_the_base_is_named_with_its_file(tmp_path):
         resolve(write_preset(tmp_path, "base: ablation/hours\n"))
 
 
-NO_DISENTANGLEMENT = {"loss.kl": 1e-4, "loss.mutual_information": 0.0, "loss.perturbation": 0.0}
+NO_DISENTANGLEMENT = {"loss.kl": 3e-5, "loss.mutual_information": 0.0, "loss.perturbation": 0.0}
 PLAIN_DECODER = {"model.use_localization": False, "model.use_shadow": False}
 ABLATIONS = {
     "pose_face": PLAIN_DECODER | {"model.use_latent": False},
