@@ -127,7 +127,11 @@ class Fit:
         return fit
 
     def bake_occlusion(self) -> None:
-        """Few missing maps at once, many beside the training, in the order in which it wants them; then those of other splits."""
+        """Bake few missing maps at once, many beside the training: in the order in which it wants them, then those of other splits.
+
+        Raises:
+            ChildProcessError: the process that bakes beside the training cannot start.
+        """
         count = len(self.capture.frames)
         missing = sum(not self.occlusion.is_baked(frame) for frame in range(count))
         if missing <= BAKED_AT_ONCE:

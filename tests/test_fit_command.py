@@ -140,7 +140,7 @@ def test_a_new_run_takes_a_free_name(tmp_path, private_cache, drawn_capture, mon
 
 
 def test_occlusion_of_many_frames_is_baked_beside_the_training(tmp_path, drawn_capture, monkeypatch, capsys):
-    """As many maps as without, in the same bytes, and the same losses; and no map is baked by the trainer."""
+    """The same losses, and maps of the same bytes. (That none is baked by the trainer: tests/rendering/test_occlusion_ahead.py.)"""
     losses, maps = [], []
     for at_once, name in ((10_000, "before"), (5, "beside")):
         monkeypatch.setattr("mitsuba_avatar.fitting.BAKED_AT_ONCE", at_once)

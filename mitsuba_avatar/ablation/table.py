@@ -76,7 +76,7 @@ def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
         measured = measures.get(row, [])
         if not measured:
             continue
-        errors, takes = [driven_errors(one) for one in measured], [_takes(one) for one in measured]
+        errors = [driven_errors(one) for one in measured]
         parts = [one.get("disentanglement", {}) for one in measured]
         minutes = [_scaled(one, "training_seconds", 60) for one in measured]
         pairs = [(error["test"], ours[one["seed"]]) for error, one in zip(errors, measured, strict=True) if ours.get(one["seed"])]
@@ -85,9 +85,7 @@ def summarize(runs: Sequence[PlannedRun]) -> list[Entry]:
                 row,
                 {split: Spread.of([one[split] for one in errors]) for split in errors[0]},
                 tuple(100 * (test / reference - 1) for test, reference in pairs) if row.name != REFERENCE else (),
-                {name: Spread.of([one[name] for one in takes]) for name in takes[0]}
-                if all(one.keys() == takes[0].keys() for one in takes)
-                else {},
+                _take_spreads(measured),
                 _take_excesses(measured, references) if row.name != REFERENCE else (),
                 tuple(_spread(parts, name) for name in LATENT_FIGURES),
                 len(measured),
@@ -109,6 +107,14 @@ def driven_errors(measures: dict) -> dict[str, float]:
 def _takes(measures: dict) -> dict[str, float]:
     """Test take -> error, of runs that were measured take by take."""
     return measures.get("images", {}).get("test", {}).get("takes", {})
+
+
+def _take_spreads(measured: Sequence[dict]) -> dict[str, Spread]:
+    """Test take -> its error over seeds; empty where the seeds do not all tell the same takes."""
+    takes = [_takes(one) for one in measured]
+    if any(one.keys() != takes[0].keys() for one in takes):
+        return {}
+    return {name: Spread.of([one[name] for one in takes]) for name in takes[0]}
 
 
 def _take_excesses(measured: Sequence[dict], references: dict[int, dict]) -> tuple[float, ...]:

@@ -222,7 +222,15 @@ class FrameOcclusion:
 
 @dataclass(frozen=True)
 class OcclusionRecipe:
-    """A `FrameOcclusion` that can be sent to another process: arguments of it and of its baker."""
+    """A `FrameOcclusion` that can be sent to another process: its arguments, and those of its baker.
+
+    Attributes:
+        rig: skeleton, skinning and topology.
+        size, rays, distance: texels of a side, rays a texel, metres; as `AmbientOcclusion` takes them.
+        template_vertices: [V, 3] metres.
+        theta: [N, D] radians.
+        folder: where maps are kept.
+    """
 
     rig: Rig
     size: int

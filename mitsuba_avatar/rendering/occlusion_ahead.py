@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from itertools import islice
 
 from jaxtyping import Float
 from torch import Tensor
@@ -28,6 +29,9 @@ class OcclusionAhead:
         frames: the sequence; maps that it has on disk are not baked again.
         order: in which its frames will be wanted, repetitions allowed; what is wanted out of order comes next. Read from the thread that
             calls `maps`.
+
+    Raises:
+        ChildProcessError: the worker cannot start.
     """
 
     def __init__(self, frames: FrameOcclusion, order: Iterable[int]):
@@ -69,11 +73,8 @@ class OcclusionAhead:
             return
         self._asked = [frame for frame in self._asked if not self.frames.is_baked(frame)]
         new = [frame for frame in wanted if frame not in self._asked and not self.frames.is_baked(frame)]
-        for frame in self._order if len(self._asked) + len(new) < AT_ONCE else ():
-            if not self.frames.is_baked(frame):
-                new.append(frame)
-            if len(self._asked) + len(new) >= AT_ONCE:
-                break
+        coming = (frame for frame in self._order if not self.frames.is_baked(frame))
+        new += islice(coming, max(AT_ONCE - len(self._asked) - len(new), 0))
         if new:
             self._asked += new
             self._send(new)
