@@ -85,7 +85,8 @@ def hidden_state(performance: Performance, rest_vertices: Float32[np.ndarray, "N
     else:
         angles = angles_that_move(person.rig, person.outfit.mesh)
         vertices = rest_vertices[kept][:, person.outfit.mesh.body_vertices]
-    return measure_hidden_state(performance.motion.theta[kept][:, angles], vertices, is_train, floor=floor)
+    theta, actions = performance.motion.theta[kept], performance.motion.actions[kept]
+    return measure_hidden_state(theta[:, angles], vertices, is_train, floor=floor, whole=np.concatenate([theta, actions], axis=1))
 
 
 def measure_gates(performance: Performance, progress: Callable[[str, int, int], None]) -> tuple[HiddenState, dict[str, float]]:

@@ -6,6 +6,8 @@ limbs keep clear of the trunk and each other; reaching brings forearm and hand t
 Symbols: N frames, D pose angles. Radians, seconds; angles are offsets from the rig's rest pose.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
@@ -15,6 +17,7 @@ from mitsuba_avatar.filming.takes import Take
 SIDES = ("left", "right")
 SHARE_OF_LIMITS = 0.75  # of an angle's range, unless SAFE says otherwise
 SHARE_OF_TRUNK = 0.55  # the same for each of the spine's five joints, which add up
+SLOW_TRUNK = 0.7  # of that while limbs move slowly: bent farther, a shirt hangs free and its history decides where
 # Ranges within which limbs keep clear of the trunk and each other (arms about 20 degrees off the torso or more; at rest they are 45
 # degrees off) and near enough to it for portrait images to be filled.
 SAFE = {
@@ -48,6 +51,7 @@ REACH_HIGH = {
     "forearm_pronation": -0.55,
     "clavicle_protraction": 0.0,
 }
+DEEPEST_REACH = 0.93  # of the way there, so that moving fingers keep off the trunk too
 SWING = {
     "trunk": 0.45,
     "neck": 0.5,
@@ -108,12 +112,32 @@ def recombined(rig: Rig, take: Take, time: np.ndarray, rng: np.random.Generator)
     return _curl_together(rig, theta, time, rng)
 
 
-def slow_limbs(rig: Rig, take: Take, time: np.ndarray, seed: int) -> Float[np.ndarray, "N D"]:
-    """One limb on its own, slowly through most of its range, from the stance and back to it."""
+def slow_limbs(
+    rig: Rig, take: Take, time: np.ndarray, seed: int, shown: Mapping[str, float], rng: np.random.Generator
+) -> Float[np.ndarray, "N D"]:
+    """One limb on its own, or a few, slowly through most of their range, from the stance and back to it. Fingers are never still.
+
+    Args:
+        rig: of the person.
+        take: whose groups move.
+        time: [N] seconds from the take's beginning.
+        seed: of the courses.
+        shown: seconds of each group's course that earlier takes showed (`showing`); the take goes on from there.
+        rng: of the fingers.
+    """
     stance = _pose(rig, STANCE, len(time))
     remaining = time[-1] - time
     envelope = np.sin(0.5 * np.pi * np.clip(np.minimum(time, remaining) / SETTLE, 0, 1)) ** 2
-    return stance + envelope[:, None] * sum(limb_offsets(rig, group, time, seed) for group in take.groups)
+    offsets = sum(limb_offsets(rig, group, shown.get(group, 0.0) + time, seed) for group in take.groups)
+    return move_fingers(rig, stance + take.extent * envelope[:, None] * offsets, time, rng)
+
+
+def showing(take: Take, duration: float, shown: Mapping[str, float]) -> dict[str, float]:
+    """Seconds of each group's course that takes have shown after a slow one of `duration` seconds.
+
+    The next begins before this one ends, so that what is lost on the way to the stance is seen as well.
+    """
+    return {**shown, **{group: shown.get(group, 0.0) + max(duration - SETTLE, 0.0) for group in take.groups}}
 
 
 def held_poses(rig: Rig, take: Take, time: np.ndarray, seed: int, rng: np.random.Generator) -> Float[np.ndarray, "N D"]:
@@ -128,10 +152,18 @@ def held_poses(rig: Rig, take: Take, time: np.ndarray, seed: int, rng: np.random
     return move_fingers(rig, theta, time, rng)
 
 
-def recomposed_limbs(rig: Rig, take: Take, time: np.ndarray, seed: int, rng: np.random.Generator) -> Float[np.ndarray, "N D"]:
-    """Limbs move as they do alone in the slow takes, but together, each at another moment of its own course."""
-    offsets = [limb_offsets(rig, group, rng.uniform(0, 40) + rng.uniform(0.8, 1.2) * time, seed) for group in take.groups]
-    return move_fingers(rig, _pose(rig, STANCE, len(time)) + sum(offsets), time, rng)
+def recomposed_limbs(
+    rig: Rig, take: Take, time: np.ndarray, seed: int, shown: Mapping[str, float], rng: np.random.Generator
+) -> Float[np.ndarray, "N D"]:
+    """Limbs move as the slow takes showed each of them, but together, each at another moment of what was `shown` of its course."""
+    offsets = []
+    for group in take.groups:
+        known = shown.get(group, 0.0)
+        start, speed, duration = rng.random(), rng.uniform(0.8, 1.2), max(time[-1] - time[0], 1e-9)
+        speed = min(speed, known / duration)
+        moments = 0.5 * SETTLE + start * (known - speed * duration) + speed * (time - time[0])
+        offsets.append(limb_offsets(rig, group, moments, seed))
+    return move_fingers(rig, _pose(rig, STANCE, len(time)) + take.extent * sum(offsets), time, rng)
 
 
 def wild(rig: Rig, take: Take, time: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray, "N D"]:
@@ -156,7 +188,7 @@ def limb_offsets(rig: Rig, group: str, time: np.ndarray, seed: int) -> Float[np.
         return offsets
     if group.endswith("_reach"):
         depth, height = (0.5 + 0.5 * _full(waves(time, share * SLOW, rng)) for share in (0.6, 0.4))
-        depth = np.sin(0.5 * np.pi * depth)  # longer near the trunk than on the way
+        depth = DEEPEST_REACH * np.sin(0.5 * np.pi * depth)  # longer near the trunk than on the way
         for part, low in REACH_LOW.items():
             index = rig.dofs.names.index(group.replace("reach", part))
             offsets[:, index] = depth * (low + height * (REACH_HIGH[part] - low) - stance[index])
@@ -168,6 +200,8 @@ def limb_offsets(rig: Rig, group: str, time: np.ndarray, seed: int) -> Float[np.
         if group in ("trunk", "neck"):  # the joints of a chain turn together, or they would undo each other
             curve = 0.8 * shared[name.rpartition("_")[2]] + 0.4 * waves(time, 0.5 * SLOW, rng)
         offsets[:, index] = 0.5 * (lower + upper) + 0.5 * (upper - lower) * _full(curve) - stance[index]
+        if group == "trunk":
+            offsets[:, index] *= SLOW_TRUNK
     if group == "trunk":  # arms give way to the flank that comes towards them
         bend = offsets[:, [index for index, name in _members(rig, group) if name.endswith("bend")]].sum(axis=1)
         for side, sign in (("left", 1.0), ("right", -1.0)):

@@ -1,8 +1,12 @@
 """How much of a garment's shape the pose explains, and how much is hidden: the part that only a latent code can carry.
 
-Three predictors are fitted to training frames and scored on others: the mean garment, linear regression on the pose angles, the mean of
-the nearest poses' garments. The hidden share is what the better of the last two leaves over. The chaos floor says how much of it no
-signal can explain: how far two simulations drift apart whose garments started a millimetre from each other.
+Predictors are fitted to training frames and scored on others: the mean garment, linear regression on the pose angles that move it, the
+mean of the nearest poses' garments. The hidden share is what the better of the last two leaves over. The chaos floor says how much of it
+no signal can explain: how far two simulations drift apart whose garments started a millimetre from each other.
+
+One more regression reads the whole driving signal, fingers and face included, as a decoder without localization does. Where chance
+correlations make it no better than the mean garment, a latent code that has swallowed all of the drive costs nothing, for z = 0 then
+decodes the mean: such a capture cannot rank avatars by what their codes leak.
 
 Symbols: N frames, D pose angles, C vertices of the garment in rest space. Metres; figures are in millimetres.
 """
@@ -16,7 +20,7 @@ from mitsuba_avatar.body.rig import Rig
 from mitsuba_avatar.filming.garment_mesh import GarmentMesh
 from mitsuba_avatar.ridge import ridge_prediction
 
-STEADY = 1e-4  # radians: an angle that varies less explains nothing
+STEADY = 1e-4  # radians, or strength of a facial action: a signal that varies less explains nothing
 INFLUENCE = 0.02  # mean skinning weight from which a joint counts as moving the garment
 LINEAR_BEATS_MEAN = 0.85  # gate: the error of linear regression relative to the mean garment's, at most
 FLOOR_BELOW_MEAN = 0.5  # gate: the chaos floor relative to the mean garment's error, at most
@@ -44,6 +48,7 @@ class HiddenState:
         train_frames, test_frames: how many were fitted and scored.
         mean, linear, nearest: errors of the three predictors on test frames.
         floor: chaos floor, where it was measured.
+        whole: error of linear regression on the whole driving signal, where it was given.
     """
 
     train_frames: int
@@ -52,6 +57,7 @@ class HiddenState:
     linear: Error
     nearest: Error
     floor: Error | None = None
+    whole: Error | None = None
 
     @property
     def hidden_mm(self) -> float:
@@ -64,8 +70,12 @@ class HiddenState:
         return (self.hidden_mm / self.mean.rms_mm) ** 2 if self.mean.rms_mm > 0 else 0.0
 
     def gates(self) -> dict[str, bool]:
-        """Whether a capture can show what the method claims: pose explains much, and what it does not is mostly not chaos."""
+        """Whether a capture can show what the method claims: pose explains much, chance correlations do not undo that, and what pose
+        does not explain is mostly not chaos.
+        """
         gates = {"linear regression on pose clearly beats the mean garment": self.linear.rms_mm <= LINEAR_BEATS_MEAN * self.mean.rms_mm}
+        if self.whole is not None:
+            gates["so does regression on the whole driving signal"] = self.whole.rms_mm <= LINEAR_BEATS_MEAN * self.mean.rms_mm
         if self.floor is not None:
             gates["the chaos floor is below half the mean garment's error"] = self.floor.rms_mm <= FLOOR_BELOW_MEAN * self.mean.rms_mm
         return gates
@@ -73,6 +83,8 @@ class HiddenState:
     def table(self) -> str:
         """The figures as text of equal columns."""
         rows = [("nothing (mean)", self.mean), ("pose, linearly", self.linear), ("nearest pose", self.nearest)]
+        if self.whole is not None:
+            rows.append(("all, linearly", self.whole))
         if self.floor is not None:
             rows.append(("itself (floor)", self.floor))
         lines = [f"{'predicted from':<16}{'RMS mm':>9}{'mean mm':>9}{'of variance':>13}"]
@@ -88,6 +100,7 @@ def measure_hidden_state(
     is_train: Bool[np.ndarray, "N"],
     neighbours: int = 1,
     floor: Error | None = None,
+    whole: Float32[np.ndarray, "N S"] | None = None,
 ) -> HiddenState:
     """Fit the predictors on training frames and score them on the others.
 
@@ -97,6 +110,7 @@ def measure_hidden_state(
         is_train: which frames are for training; the others are scored.
         neighbours: poses whose garments the nearest-pose prediction averages.
         floor: the chaos floor, to be reported beside.
+        whole: everything that drives, to be scored beside the pose.
 
     Raises:
         ValueError: if there are fewer than two training frames or no test frame.
@@ -106,11 +120,7 @@ def measure_hidden_state(
             f"measure_hidden_state(): expected at least 2 training frames and 1 other; got {is_train.sum()} and {(~is_train).sum()}. "
             "Film more frames, or give a split."
         )
-    angles = theta.astype(np.float64)
-    mean, spread = angles[is_train].mean(axis=0), angles[is_train].std(axis=0)
-    varied = spread > STEADY
-    # In radians, not in standard deviations: for the nearest pose a finger that hardly moves must not count like a shoulder.
-    angles, spread = (angles - mean)[:, varied], spread[varied]
+    angles, spread = _varied(theta, is_train)
     flat = vertices.reshape(len(vertices), -1).astype(np.float64)
     average = flat[is_train].mean(axis=0)
     garment = flat - average
@@ -119,14 +129,26 @@ def measure_hidden_state(
     def error(predicted: np.ndarray) -> Error:
         return Error.of((predicted - test[1]).reshape(len(predicted), -1, 3))
 
+    def linear(signals: np.ndarray) -> Error:
+        return error(ridge_prediction(signals[is_train], train[1], signals[~is_train]))
+
     return HiddenState(
         train_frames=int(is_train.sum()),
         test_frames=int((~is_train).sum()),
         mean=error(np.zeros_like(test[1])),
-        linear=error(ridge_prediction(train[0] / spread, train[1], test[0] / spread)),
+        linear=linear(angles / spread),
+        # In radians, not in standard deviations: a finger that hardly moves must not count like a shoulder.
         nearest=error(train[1][_nearest(train[0], test[0], neighbours)].mean(axis=1)),
         floor=floor,
+        whole=None if whole is None else linear(np.divide(*_varied(whole, is_train))),
     )
+
+
+def _varied(signals: Float32[np.ndarray, "N S"], is_train: Bool[np.ndarray, "N"]) -> tuple[np.ndarray, np.ndarray]:
+    """Signals that vary between training frames, less their mean there, [N, s], and their deviations, [s]."""
+    signals = signals.astype(np.float64)
+    mean, spread = signals[is_train].mean(axis=0), signals[is_train].std(axis=0)
+    return (signals - mean)[:, spread > STEADY], spread[spread > STEADY]
 
 
 def angles_that_move(rig: Rig, mesh: GarmentMesh) -> Int[np.ndarray, "A"]:

@@ -6,7 +6,7 @@ Live Link Face for the face. Test takes of the study are brought to a set distan
 Symbols: N frames, D pose angles, A facial actions. Radians, metres, seconds; angles are offsets from the rig's rest pose.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,11 +128,13 @@ def parts_of(count: int) -> list[slice]:
 def _act(rig: Rig, settings: StudioSettings, action_names: Sequence[str], takes: tuple[Take, ...]) -> Motion:
     """Perform the takes of a script."""
     planned = plan_takes(takes, settings.motion)
-    theta, root, actions = [], [], []
+    theta, root, actions, shown = [], [], [], {}
     for order, plan in enumerate(planned):
         rng = np.random.default_rng([settings.seed, order])
         time = np.arange(plan.count) / settings.motion.fps
-        angles = _angles(rig, plan.take, time, settings.seed, rng)
+        angles = _angles(rig, plan.take, time, settings.seed, shown, rng)
+        if plan.take.style == "slow":
+            shown = choreography.showing(plan.take, plan.count / settings.motion.fps, shown)
         if plan.take.style in ("recomposed", "gestures"):
             angles = _at_distance(rig, angles, _training_poses(planned[:order], theta))
         gaze, face = _face(plan.take, time, action_names, rng)
@@ -170,14 +172,16 @@ def _play(rig: Rig, settings: StudioSettings, action_names: Sequence[str]) -> Mo
     return Motion(frames, theta, root, actions, clearance, tuple(dict.fromkeys(notes)))
 
 
-def _angles(rig: Rig, take: Take, time: np.ndarray, seed: int, rng: np.random.Generator) -> Float[np.ndarray, "N D"]:
-    """The curves of a take."""
+def _angles(
+    rig: Rig, take: Take, time: np.ndarray, seed: int, shown: Mapping[str, float], rng: np.random.Generator
+) -> Float[np.ndarray, "N D"]:
+    """The curves of a take after slow ones that have `shown` some seconds of each limb's course."""
     if take.style == "slow":
-        return choreography.slow_limbs(rig, take, time, seed)
+        return choreography.slow_limbs(rig, take, time, seed, shown, rng)
     if take.style == "held":
         return choreography.held_poses(rig, take, time, seed, rng)
     if take.style == "recomposed":
-        return choreography.recomposed_limbs(rig, take, time, seed, rng)
+        return choreography.recomposed_limbs(rig, take, time, seed, shown, rng)
     styles = {
         "range": choreography.range_of_motion,
         "conversation": choreography.conversation,

@@ -1,9 +1,10 @@
 """Scripts: which takes a person performs, how many frames each has, and which of them are for training, validation and testing.
 
-`default` is short and moves everything. `study` is made for finding out what the pose does not tell: each limb moves slowly on its own,
-arms reach in front of the trunk and shade it, face and fingers move while the body holds still (so that training frames link expressions
-and poses that have nothing to do with each other), blocks of training takes are held out for validation, and test takes put limb movements
-together that training never showed at once.
+`default` is short and moves everything. `study` is made for finding out what the pose does not tell: each limb moves slowly on its own
+and some in pairs, arms reach in front of the trunk and shade it, a conversation moves all of the upper body a little (the paper, section
+4.1, trains on both), face and fingers move while the body holds still (so that training frames link expressions and poses that have nothing
+to do with each other), blocks of training takes are held out for validation, and test takes put limb movements together that training
+never showed at once.
 """
 
 from dataclasses import dataclass
@@ -28,8 +29,9 @@ class Take:
         style: "range" (one group at a time), "conversation" or "recombined" (all at once, wide), "slow" (one limb or a few, slowly), "held"
             (the body holds poses, fingers move), "recomposed" (limbs as in the slow takes, at once, at most a set distance from training),
             "gestures" (conversation at that distance), "wild" (fast and wide).
-        face: what the face does.
         share: of the split's frames.
+        face: what the face does.
+        extent: share of its slow course that each limb of a recomposed take goes; hands that reach would enter a trunk bent all the way.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Take:
     groups: tuple[str, ...]
     share: float
     face: Face = "resting"
+    extent: float = 1.0
 
 
 DEFAULT = (
@@ -48,22 +51,27 @@ DEFAULT = (
     Take("test_conversation", "test", "conversation", ("arms", "trunk", "neck", "hands"), 0.4, "conversation"),
 )
 STUDY = (
-    Take("slow_trunk", "train", "slow", ("trunk",), 0.10),
-    Take("slow_head", "train", "slow", ("neck",), 0.05),
-    Take("slow_left_arm", "train", "slow", ("left_arm",), 0.10),
-    Take("slow_right_arm", "train", "slow", ("right_arm",), 0.10),
-    Take("slow_left_reach", "train", "slow", ("left_reach",), 0.10),
-    Take("slow_right_reach", "train", "slow", ("right_reach",), 0.10),
-    Take("slow_reaches", "train", "slow", ("left_reach", "right_reach"), 0.08),
-    Take("slow_left_leg", "train", "slow", ("left_leg",), 0.06),
-    Take("slow_right_leg", "train", "slow", ("right_leg",), 0.06),
-    Take("slow_knee_bends", "train", "slow", ("knee_bends",), 0.04),
-    Take("slow_hands", "train", "slow", ("hands",), 0.04),
-    Take("held_expressions", "train", "held", ("trunk", "left_arm", "right_reach"), 0.08, "expressions"),
-    Take("held_speech", "train", "held", ("trunk", "left_reach", "right_arm"), 0.08, "conversation"),
+    Take("slow_trunk", "train", "slow", ("trunk",), 0.04),
+    Take("slow_head", "train", "slow", ("neck",), 0.04),
+    Take("slow_left_arm", "train", "slow", ("left_arm",), 0.04),
+    Take("slow_right_arm", "train", "slow", ("right_arm",), 0.04),
+    Take("slow_left_reach", "train", "slow", ("left_reach",), 0.05),
+    Take("slow_right_reach", "train", "slow", ("right_reach",), 0.05),
+    Take("slow_left_leg", "train", "slow", ("left_leg",), 0.03),
+    Take("slow_right_leg", "train", "slow", ("right_leg",), 0.03),
+    Take("slow_knee_bends", "train", "slow", ("knee_bends",), 0.03),
+    Take("slow_head_and_hands", "train", "slow", ("neck", "hands"), 0.03),
+    Take("slow_reaches", "train", "slow", ("left_reach", "right_reach"), 0.09),
+    Take("slow_trunk_and_arms", "train", "slow", ("trunk", "left_arm", "right_arm"), 0.12),
+    Take("slow_trunk_and_head", "train", "slow", ("trunk", "neck"), 0.04),
+    Take("slow_knee_bends_and_arms", "train", "slow", ("knee_bends", "left_arm", "right_arm"), 0.08),
+    Take("slow_right_reach_and_left_arm", "train", "slow", ("right_reach", "left_arm"), 0.06),
+    Take("conversation", "train", "conversation", ("arms", "trunk", "neck", "hands"), 0.15, "conversation"),
+    Take("held_expressions", "train", "held", ("trunk", "left_arm", "right_reach"), 0.04, "expressions"),
+    Take("held_speech", "train", "held", ("trunk", "left_reach", "right_arm"), 0.04, "conversation"),
     Take("test_arms", "test", "recomposed", ("left_arm", "right_arm"), 0.15, "expressions"),
     Take("test_reaches", "test", "recomposed", ("left_reach", "right_reach", "neck"), 0.25, "conversation"),
-    Take("test_reaches_and_trunk", "test", "recomposed", ("left_reach", "right_reach", "trunk", "neck"), 0.25, "expressions"),
+    Take("test_reaches_and_trunk", "test", "recomposed", ("left_reach", "right_reach", "trunk", "neck"), 0.25, "expressions", 0.93),
     Take("test_whole_body", "test", "recomposed", ("left_arm", "right_reach", "neck", "knee_bends"), 0.15, "expressions"),
     Take("test_conversation", "test", "gestures", ("arms", "trunk", "neck", "hands"), 0.20, "conversation"),
 )

@@ -56,6 +56,18 @@ def test_gates_and_table_say_what_the_figures_say():
     assert nothing.linear == nothing.mean and nothing.gates() == {"linear regression on pose clearly beats the mean garment": False}
 
 
+def test_a_finger_that_told_of_the_pose_in_training_alone_fails_the_gate_of_the_whole_drive():
+    """In training a finger moves with the elbow, in the test against it: a regression that reads both halves the weight of each."""
+    theta, vertices, is_train = _constructed(3, hidden=0.0, count=120)
+    finger = np.where(is_train, theta[:, 0], -3 * theta[:, 0])[:, None]
+    misled = measure_hidden_state(theta, vertices, is_train, whole=np.concatenate([theta, finger], axis=1))
+    np.testing.assert_allclose(misled.whole.rms_mm, 2 * misled.mean.rms_mm, rtol=0.15)
+    told = measure_hidden_state(theta, vertices, is_train, whole=theta)
+    assert told.whole == told.linear
+    gate = "so does regression on the whole driving signal"
+    assert told.gates()[gate] and not misled.gates()[gate] and "all, linearly" in misled.table()
+
+
 def test_a_split_without_test_frames_is_refused():
     theta, vertices, _ = _constructed(0, hidden=0.0)
     with pytest.raises(ValueError, match="at least 2 training frames and 1 other; got 60 and 0"):
