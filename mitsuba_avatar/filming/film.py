@@ -76,7 +76,7 @@ def film_capture(
         OSError: no write permission, disk full.
     """
     folder = Path(folder)
-    if (folder / "capture.yaml").is_file() and _filmed_with(folder) == _signature(settings):
+    if _is_filmed(folder, settings):
         return Capture.open(folder)
     find_resource("scenes", settings.light.scene, ".xml")  # a wrong name is told before the work, not after
     return _Filming(settings, folder, progress or _silent, shard or Shard()).run()
@@ -85,10 +85,15 @@ def film_capture(
 def rehearse(settings: StudioSettings, folder: Path | str, progress: Progress) -> tuple[HiddenState, dict[str, float]]:
     """Simulate all garments of a capture, which `film_capture` finds in the folder, and measure what it could show; see `measure_gates`.
 
+    Of a finished capture of the same settings, whose garments are kept, it measures what it does show.
+
     Raises:
         as `film_capture`, and ValueError if there are no test frames to score on.
     """
-    return measure_gates(_Filming(settings, Path(folder), progress, Shard()).performance, progress)
+    folder = Path(folder)
+    if _is_filmed(folder, settings):
+        return measure_gates(Performance(settings, folder / TRUTH_FOLDER), progress)
+    return measure_gates(_Filming(settings, folder, progress, Shard()).performance, progress)
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -249,5 +254,6 @@ def _signature(settings: StudioSettings) -> str:
     return f"mitsuba_avatar.studio {default_capture_path(settings).name}"
 
 
-def _filmed_with(folder: Path) -> str:
-    return Capture.open(folder).description.source
+def _is_filmed(folder: Path, settings: StudioSettings) -> bool:
+    """Whether a folder holds a finished capture of these settings."""
+    return (folder / "capture.yaml").is_file() and Capture.open(folder).description.source == _signature(settings)
