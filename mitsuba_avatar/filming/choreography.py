@@ -129,7 +129,7 @@ def slow_limbs(
     remaining = time[-1] - time
     envelope = np.sin(0.5 * np.pi * np.clip(np.minimum(time, remaining) / SETTLE, 0, 1)) ** 2
     offsets = sum(limb_offsets(rig, group, shown.get(group, 0.0) + time, seed) for group in take.groups)
-    return move_fingers(rig, stance + take.extent * envelope[:, None] * offsets, time, rng)
+    return move_fingers(rig, stance + envelope[:, None] * offsets, time, rng)
 
 
 def showing(take: Take, duration: float, shown: Mapping[str, float]) -> dict[str, float]:
