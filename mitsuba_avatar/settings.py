@@ -8,6 +8,7 @@ Units are SI (metres, radians, seconds) and pixels or texels unless a name says 
 from dataclasses import dataclass, field
 from typing import Any
 
+PRECISIONS = ("float32", "mixed", "auto")
 _RANGES = {
     "positive": lambda value: value > 0,
     "zero or more": lambda value: value >= 0,
@@ -194,6 +195,7 @@ class TrainingSettings:
     views_per_pose: int = 4
     learning_rate: float = 2e-3  # paper: 1e-3, for days of training
     learning_rate_final: float = 1e-4  # cosine decay ends here
+    precision: str = "float32"  # of hidden layers; "mixed": bfloat16; "auto": mixed where the device has instructions for it
     gradient_clip: float = 1.0  # global norm
     explosion_factor: float = 10.0  # a step whose loss exceeds the running mean by this factor is skipped
     skipped_steps: int = 2  # bad steps within 20 iterations that a run survives
@@ -207,6 +209,10 @@ class TrainingSettings:
         expect(self, "positive", "checkpoint_every", "validate_every", "preview_every")
         expect(self, "positive", "explosion_factor")
         expect(self, "zero or more", "seed", "skipped_steps")
+        if self.precision not in PRECISIONS:
+            raise ValueError(
+                f"TrainingSettings(): expected precision to be one of {', '.join(PRECISIONS)}; got {self.precision!r}. Change it."
+            )
 
 
 @dataclass(frozen=True)

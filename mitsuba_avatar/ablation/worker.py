@@ -51,6 +51,7 @@ def _work(run: PlannedRun) -> int:
         "name": run.row.name,
         "seed": run.settings.training.seed,
         "iterations": run.settings.training.iterations,
+        "mixed_precision": fit.avatar.mixed_precision,
         "training_seconds": fit.trainer.seconds,
         "num_skipped": fit.trainer.guard.num_skipped,
         "parameters": sum(parameter.numel() for parameter in avatar.parameters()),

@@ -43,14 +43,7 @@ def blend_transforms(
     Raises:
         ValueError: if the joint counts differ.
     """
-    batch, joints = posed_from_rest.shape[:2]
-    if skinning_weights.shape[1] != joints:
-        raise ValueError(
-            f"blend_transforms(): skinning_weights must be [V, {joints}] for these joints; got {list(skinning_weights.shape)}. "
-            "Take weights and skeleton from the same rig."
-        )
-    rows = posed_from_rest[:, :, :3, :].reshape(batch, joints, 12)
-    return (skinning_weights @ rows).reshape(batch, -1, 3, 4)
+    return _blended(posed_from_rest, skinning_weights).permute(0, 3, 1, 2)
 
 
 def pose_vertices(
@@ -74,8 +67,10 @@ def pose_vertices(
     Source: arXiv:2105.10441, section 3.4.1.
     """
     _check_vertex_count("pose_vertices", rest_vertices.shape[1], skinning_weights)
-    blended = blend_transforms(posed_from_rest, skinning_weights)
-    return (blended[..., :3] * rest_vertices[:, :, None, :]).sum(-1) + blended[..., 3]
+    blended = _blended(posed_from_rest, skinning_weights)
+    rest = rest_vertices.transpose(1, 2).contiguous()  # [B, 3, V]
+    posed = (blended[:, :, :3] * rest[:, None]).sum(2) + blended[:, :, 3]
+    return posed.transpose(1, 2).contiguous()
 
 
 def unpose_vertices(
@@ -102,15 +97,15 @@ def unpose_vertices(
     Source: arXiv:2105.10441, section 3.2.
     """
     _check_vertex_count("unpose_vertices", posed_vertices.shape[1], skinning_weights)
-    blended = blend_transforms(posed_from_rest, skinning_weights)
-    offset = posed_vertices - blended[..., 3]
+    blended = _blended(posed_from_rest, skinning_weights)
+    offset = posed_vertices.transpose(1, 2) - blended[:, :, 3]  # [B, 3, V]
     # Cramer's rule on columns a, b, c: far faster than a batched LAPACK inverse of thousands of 3x3 matrices.
-    first, second, third = blended[..., 0], blended[..., 1], blended[..., 2]
-    across = torch.linalg.cross(second, third)
-    determinant = (first * across).sum(-1, keepdim=True)
+    first, second, third = blended[:, :, 0], blended[:, :, 1], blended[:, :, 2]
+    across, aside = _cross(second, third), _cross(first, offset)
+    determinant = (first * across).sum(1)  # [B, V]
     safe = torch.where(determinant.abs() < SMALLEST_DETERMINANT, torch.full_like(determinant, SMALLEST_DETERMINANT), determinant)
-    rows = torch.stack([across, torch.linalg.cross(third, first), torch.linalg.cross(first, second)], dim=-2)
-    return (rows * offset[:, :, None, :]).sum(-1) / safe
+    rest = torch.stack([(offset * across).sum(1), (third * aside).sum(1), -(second * aside).sum(1)], dim=-1)
+    return rest / safe[..., None]
 
 
 def rest_directions_from_posed(
@@ -132,11 +127,31 @@ def rest_directions_from_posed(
         ValueError: if the vertex counts differ.
     """
     _check_vertex_count("rest_directions_from_posed", directions.shape[-2], skinning_weights)
-    blended = blend_transforms(posed_from_rest, skinning_weights)[..., :3]  # [B, V, 3, 3]
+    blended = blend_transforms(posed_from_rest, skinning_weights)[..., :3].contiguous()  # [B, V, 3, 3]
     batch, count = blended.shape[:2]
     flat = directions.reshape(batch, -1, count, 3)
     turned = (flat[..., :, None] * blended[:, None]).sum(-2).reshape(directions.shape)
     return torch.nn.functional.normalize(turned, dim=-1)
+
+
+def _blended(
+    posed_from_rest: Float[Tensor, "B J 4 4"], skinning_weights: Float[Tensor, "vertices joints"]
+) -> Float[Tensor, "B 3 4 vertices"]:
+    """What `blend_transforms` gives, with vertices last: one matrix product, and what follows runs along memory instead of in threes,
+    which takes a third of the time."""
+    batch, joints = posed_from_rest.shape[:2]
+    if skinning_weights.shape[1] != joints:
+        raise ValueError(
+            f"blend_transforms(): skinning_weights must be [V, {joints}] for these joints; got {list(skinning_weights.shape)}. "
+            "Take weights and skeleton from the same rig."
+        )
+    entries = posed_from_rest[:, :, :3].permute(0, 2, 3, 1).reshape(batch * 12, joints)
+    return (entries @ skinning_weights.T).reshape(batch, 3, 4, -1)
+
+
+def _cross(first: Float[Tensor, "B 3 V"], second: Float[Tensor, "B 3 V"]) -> Float[Tensor, "B 3 V"]:
+    """Cross product over the middle; several times faster than torch's, which takes it vector by vector."""
+    return first.roll(-1, 1) * second.roll(1, 1) - first.roll(1, 1) * second.roll(-1, 1)
 
 
 def _check_vertex_count(function: str, count: int, skinning_weights: Float[Tensor, "vertices joints"]) -> None:

@@ -30,9 +30,29 @@ def encode(linear: Array, curve: str) -> Array:
     """
     if not _is_srgb(curve, "encode"):
         return linear
+    if isinstance(linear, Tensor):
+        return _SrgbEncoding.apply(linear)
     # Clipping the unused branch keeps its power, and the gradient of its power, from becoming NaN below the knee.
     curved = 1.055 * linear.clip(SRGB_LINEAR_KNEE, None) ** (1 / 2.4) - 0.055
     return _where(linear <= SRGB_LINEAR_KNEE, 12.92 * linear, curved)
+
+
+class _SrgbEncoding(torch.autograd.Function):
+    """The curve with its own derivative, for which the power need not be taken again: every training step encodes its pictures."""
+
+    @staticmethod
+    def forward(context, linear):
+        is_straight = linear <= SRGB_LINEAR_KNEE
+        clipped = linear.clip(SRGB_LINEAR_KNEE, None)  # keeps the power of the unused branch from becoming NaN
+        power = clipped.pow(1 / 2.4).mul_(1.055)
+        context.save_for_backward(is_straight, clipped, power)
+        return torch.where(is_straight, 12.92 * linear, power - 0.055)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(context, gradient):
+        is_straight, clipped, power = context.saved_tensors
+        return gradient * torch.where(is_straight, 12.92, (power / clipped).mul_(1 / 2.4))
 
 
 def decode(encoded: Array, curve: str) -> Array:

@@ -12,6 +12,8 @@ T texture_size. Metres, radians, linear radiance.
 Source: arXiv:2105.10441, sections 3.2 to 3.4.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -95,6 +97,8 @@ class Avatar(nn.Module):
         avatar.load_state_dict(state)
         output = avatar.decode(theta, root, face, None, camera_centers, ambient_occlusion)
 
+    Networks compute in float32, except in training (`train()`) after `mixed_precision` was set: then hidden layers compute in bfloat16.
+
     The state holds weights and training statistics; everything that follows from rig and settings is rebuilt from them.
 
     Args:
@@ -110,6 +114,7 @@ class Avatar(nn.Module):
         super().__init__()
         _check_statistics(rig, settings, statistics)
         self.settings = settings
+        self.mixed_precision = False
         self.standardize_theta = Standardization(statistics.theta_mean, statistics.theta_std)
         self.standardize_face = Standardization(statistics.face_mean, statistics.face_std)
         self.register_buffer("mean_texture", statistics.mean_texture.clone())
@@ -156,7 +161,9 @@ class Avatar(nn.Module):
         if self.encoder is None or self.encoder_atlas is None:
             raise ValueError("encode(): expected an avatar with an encoder; model.use_latent is false. Decode with z = None.")
         offsets = (unposed_vertices - self.template_vertices) / self.settings.displacement_scale
-        return self.encoder(self.encoder_atlas.texels_from_vertices(offsets))
+        texels = self.encoder_atlas.texels_from_vertices(offsets)
+        with self._networks():
+            return self.encoder(texels)
 
     def decode(
         self,
@@ -183,12 +190,10 @@ class Avatar(nn.Module):
             ValueError: if a latent code is given to an avatar that has none, or ambient occlusion is missing or of another size.
         """
         posed_from_rest = self.skeleton(theta, root)
-        maps = self.decoder(
-            self.standardize_theta(theta),
-            self.standardize_face(face),
-            self._latent(z, len(theta)),
-            self.view_maps(posed_from_rest, camera_centers),
-        )
+        signals = self.standardize_theta(theta), self.standardize_face(face), self._latent(z, len(theta))
+        view = self.view_maps(posed_from_rest, camera_centers)
+        with self._networks():
+            maps = self.decoder(*signals, view)
         rest_vertices = self._displaced(maps.displacement)
         vertices = pose_vertices(rest_vertices, posed_from_rest, self.skinning_weights)
         gain = self._gain(ambient_occlusion, len(theta))
@@ -198,8 +203,10 @@ class Avatar(nn.Module):
         self, theta: Float[Tensor, "P D"], face: Float[Tensor, "P F"], z: Float[Tensor, "P Z"] | None
     ) -> Float[Tensor, "P V 3"]:
         """The `rest_vertices` of `decode` alone, without cameras, occlusion or texture; arguments, gradients and errors as there."""
-        z = self._latent(z, len(theta))
-        return self._displaced(self.decoder.displacement(self.standardize_theta(theta), self.standardize_face(face), z))
+        signals = self.standardize_theta(theta), self.standardize_face(face), self._latent(z, len(theta))
+        with self._networks():
+            displacement = self.decoder.displacement(*signals)
+        return self._displaced(displacement)
 
     def decode_vertices(
         self, theta: Float[Tensor, "P D"], root: Float[Tensor, "P 4 4"], face: Float[Tensor, "P F"], z: Float[Tensor, "P Z"] | None
@@ -249,6 +256,15 @@ class Avatar(nn.Module):
         z, posterior = self._draw_latent(registered_vertices, theta, root, noise)
         return self.decode_vertices(theta, root, face, z), posterior
 
+    @contextmanager
+    def _networks(self) -> Iterator[None]:
+        """The precision in which encoder, decoder and shadow branch compute; what skins and textures the surface stays outside."""
+        if not (self.mixed_precision and self.training):
+            yield
+            return
+        with torch.autocast(self.mean_texture.device.type, torch.bfloat16):
+            yield
+
     def _draw_latent(
         self, registered_vertices: Tensor | None, theta: Tensor, root: Tensor, noise: Tensor | None
     ) -> tuple[Tensor | None, Posterior | None]:
@@ -287,7 +303,8 @@ class Avatar(nn.Module):
                 f"decode(): ambient_occlusion must be [{poses}, 1, {size}, {size}] for this avatar; got {got}. "
                 "Bake it at model.texture_size / model.shadow_downscale, on pose_template()."
             )
-        return self.shadow(ambient_occlusion)
+        with self._networks():
+            return self.shadow(ambient_occlusion)
 
     def _textures(
         self, texture: Float[Tensor, "P 3 T T"], view_texture: Float[Tensor, "P N 3 W W"], gain: Float[Tensor, "P 1 S S"]

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last, convolution
+from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, convolution
 
 
 class Standardization(nn.Module):
@@ -50,8 +50,8 @@ class LocalizedSignal(nn.Module):
 
     def __init__(self, masks: Float[Tensor, "D S S"], channels: int | None):
         super().__init__()
-        # Rebuilt from the rig, hence no part of a checkpoint.
-        self.register_buffer("masks", masks.clone(), persistent=False)
+        # Rebuilt from the rig, hence no part of a checkpoint. Entries last in memory, as the products of the masks are wanted.
+        self.register_buffer("masks_entries_last", masks.permute(1, 2, 0).contiguous(), persistent=False)
         entries, size = masks.shape[:2]
         self.channels = entries if channels is None else channels
         self.scale = entries**-0.5 if channels is None else 1.0
@@ -62,4 +62,10 @@ class LocalizedSignal(nn.Module):
 
     def forward(self, signal: Float[Tensor, "B D"]) -> Float[Tensor, "B C S S"]:
         """Embedding e of a standardised signal. Outside its masks an entry has no influence whatever."""
-        return self.projection(channels_last(self.masks * (self.scale * signal)[:, :, None, None]))
+        masked = self.masks_entries_last * (self.scale * signal)[:, None, None]  # [B, S, S, D]
+        return self.projection(masked.permute(0, 3, 1, 2))
+
+    @property
+    def masks(self) -> Float[Tensor, "D S S"]:
+        """Where each entry may act, 0 or 1."""
+        return self.masks_entries_last.permute(2, 0, 1)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mitsuba_avatar.model.conditioning import LocalizedSignal
-from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last, convolution, doubling, start_at_zero
+from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, biased_in_full_precision, channels_last, convolution, doubling, start_at_zero
 from mitsuba_avatar.settings import ModelSettings
 
 VIEW_COORDINATES = 4  # direction to the camera in rest space, and its cosine with the rest surface's normal
@@ -89,7 +89,7 @@ class Branch(nn.Module):
         features = [trunk]
         for layer in self.hidden:
             features.append(functional.leaky_relu(layer(features[-1]), NEGATIVE_SLOPE))
-        return self.last(features[-1]), features
+        return biased_in_full_precision(self.last, features[-1]), features
 
 
 class ViewBranch(nn.Module):
@@ -118,7 +118,7 @@ class ViewBranch(nn.Module):
         poses, cameras = view.shape[:2]
         shared = self.from_features(features).repeat_interleave(cameras, dim=0)  # [P * N, C, W, W], cameras fastest
         own = self.from_view(channels_last(view.flatten(0, 1)))
-        return self.last(self.hidden(shared + own)).unflatten(0, (poses, cameras))
+        return biased_in_full_precision(self.last, self.hidden(shared + own)).unflatten(0, (poses, cameras))
 
 
 class Decoder(nn.Module):

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last
+from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last, in_full_precision
 from mitsuba_avatar.settings import ModelSettings
 
 # In units of `displacement_scale`. Unposing sends the vertices of a folded joint far away (see body.skinning.unpose_vertices), and one
@@ -72,7 +72,7 @@ class Encoder(nn.Module):
             offsets: [P, 3, S, S] unposed registered surface minus template, in units of `displacement_scale`, S = encoder_size.
         """
         features = self.convolutions(channels_last(offsets.clamp(-LARGEST_OFFSET, LARGEST_OFFSET)))
-        features = features.flatten(1)
+        features = features.flatten(1).to(self.head.weight.dtype)
         features = features / (1 + features.square().mean(1, keepdim=True)).sqrt()  # root mean square below one
-        mu, logvar = self.head(self.head_scale * features).chunk(2, dim=1)  # [P, Z] each
+        mu, logvar = in_full_precision(self.head, self.head_scale * features).chunk(2, dim=1)  # [P, Z] each
         return Posterior(mu, logvar)

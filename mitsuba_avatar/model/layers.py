@@ -33,13 +33,35 @@ class UntiedBias(nn.Module):
         self.bias = nn.Parameter(torch.zeros(size, size, channels))
 
     def forward(self, maps: Float[Tensor, "B C S S"]) -> Float[Tensor, "B C S S"]:
-        """Maps plus bias. Gradients: to both."""
-        return maps + self.bias.permute(2, 0, 1)
+        """Maps plus bias, of the maps' own type. Gradients: to both."""
+        return maps + self.bias.permute(2, 0, 1).to(maps.dtype)
 
 
 def channels_last(maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
     """The same maps with channels last in memory; convolutions keep that order, and on a CPU it makes them 1.2 to 5 times faster."""
     return maps.contiguous(memory_format=torch.channels_last)
+
+
+def in_full_precision(layer: nn.Module, features: Float[Tensor, "B *sizes"]) -> Float[Tensor, "B *sizes_out"]:
+    """Apply a layer in the type of its parameters, also where mixed precision computes the rest in bfloat16.
+
+    For layers whose output is a posterior or a gain.
+    """
+    device = features.device.type
+    if not torch.amp.is_autocast_available(device) or not torch.is_autocast_enabled(device):
+        return layer(features)
+    with torch.autocast(device, enabled=False):
+        return layer(features.to(next(layer.parameters()).dtype))
+
+
+def biased_in_full_precision(layer: nn.Sequential, features: Float[Tensor, "B C S S"]) -> Float[Tensor, "B D _ _"]:
+    """A last layer, whose untied biases are added in their own type also where mixed precision computes the rest in bfloat16.
+
+    Nearly all of a displacement or a texture that does not change from frame to frame is in these biases. Of what the convolution adds
+    eight bits are enough: 0.06 mm of a fold of three centimetres.
+    """
+    weighted, bias = layer
+    return bias(weighted(features).to(weighted.weight.dtype))
 
 
 def convolution(in_channels: int, out_channels: int, size: int, kernel: int = 3) -> nn.Sequential:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last
+from mitsuba_avatar.model.layers import NEGATIVE_SLOPE, channels_last, in_full_precision
 from mitsuba_avatar.settings import ModelSettings
 
 # Bound on |log gain|: a gain stays within 1/7.4 .. 7.4, so no early step can black out a texture or let it explode.
@@ -50,7 +50,7 @@ class ShadowUNet(nn.Module):
         for level in self.up:
             wider = functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
             features = level(torch.cat([wider, skips.pop()], dim=1))
-        bounded = torch.tanh(self.last(features) / LARGEST_LOG_GAIN)
+        bounded = torch.tanh(in_full_precision(self.last, features) / LARGEST_LOG_GAIN)
         return torch.exp(LARGEST_LOG_GAIN * bounded)
 
 

@@ -35,6 +35,7 @@ from mitsuba_avatar.training.distributed import Process
 from mitsuba_avatar.training.divergence import DivergedError, DivergenceGuard, SkippedStep
 from mitsuba_avatar.training.losses import LATENT_TERMS, LossInputs, evaluate_losses, loss_weights, weighted_sum
 from mitsuba_avatar.training.mutual_information import MutualInformation
+from mitsuba_avatar.training.precision import is_mixed
 
 SEED_STRIDE = 1 << 20  # renderer seeds of different ranks and runs stay apart for a million iterations
 
@@ -76,6 +77,7 @@ class Trainer:
         self.avatar, self.reader, self.settings, self.process = avatar, reader, settings, process
         self.model: nn.Module = _data_parallel(avatar) if process.is_distributed else avatar
         self.device = next(avatar.parameters()).device
+        avatar.mixed_precision = is_mixed(training, self.device)
         self.renderer = SurfaceRenderer(
             rig.topology,
             reader.width,
