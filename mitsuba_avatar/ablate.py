@@ -8,6 +8,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from mitsuba_avatar.ablation.adoption import adopt
 from mitsuba_avatar.ablation.plan import REHEARSAL, capture_digest, plan_runs
 from mitsuba_avatar.ablation.rows import choose_rows
 from mitsuba_avatar.ablation.schedule import default_jobs, run_workers
@@ -34,6 +35,8 @@ class AblateCommand:
     budget: float = 1.0  # factor on the number of iterations of every row
     rehearsal: bool = False  # learn from registered meshes alone: minutes instead of hours; the table is then in millimetres
     jobs: int = 0  # rows trained at a time; default: one a core, at most four
+    measured: str = ""  # table.json of runs that were measured elsewhere, separated by commas: seeds that are not trained again
+    first_seed: int = 0  # seeds are counted from here: for a share of them on another machine
     variant: str = "auto"  # Mitsuba variant, for filming
 
 
@@ -51,7 +54,10 @@ def main(arguments: list[str] | None = None) -> int:
         # Of a data set read in place, the folder in the cache is named after the data set's state: its path tells as much.
         digest = capture_digest(capture) if SourceName.parse(command.capture) is None else None
         words = [*(REHEARSAL if command.rehearsal else ()), *overrides]
-        runs = plan_runs(folder, rows, command.seeds, command.budget, capture, words, digest)
+        seeds = range(command.first_seed, command.first_seed + command.seeds)
+        runs = plan_runs(folder, rows, seeds, command.budget, capture, words, digest)
+        for table in filter(None, command.measured.split(",")):
+            adopt(runs, Path(table.strip()))
         for run in runs:
             run.note_capture()
         iterations = sum(run.settings.training.iterations for run in runs)

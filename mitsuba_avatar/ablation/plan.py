@@ -23,6 +23,7 @@ from mitsuba_avatar.settings import Settings
 REHEARSAL = ("loss.image=0.0", "loss.mask=0.0", "loss.geometry_after=1.0", "training.poses_per_batch=4", "training.views_per_pose=1")
 MEASURES = "measures.json"
 PLANNED = "planned.yaml"  # settings that a worker is told to train with
+ADOPTED = "adopted_from"  # of the measures of a run that was measured elsewhere, see ablation.adoption: which table they are from
 CAPTURE_NOTE = "capture.json"  # which content of the capture a run was begun on
 DIGESTED_ARRAYS = ("theta", "root", "face", "vertices")  # of a capture: what is learnt from
 COUNTED_FOLDERS = ("images", "masks", "backgrounds")
@@ -119,14 +120,14 @@ class PlannedRun:
 
 
 def plan_runs(
-    folder: Path, rows: tuple[Row, ...], seeds: int, budget: float, capture: Path, overrides: list[str], digest: str | None = None
+    folder: Path, rows: tuple[Row, ...], seeds: range, budget: float, capture: Path, overrides: list[str], digest: str | None = None
 ) -> list[PlannedRun]:
     """All runs of an ablation, seed by seed, so that a first complete table comes early.
 
     Args:
         folder: of the ablation.
         rows: which.
-        seeds: number of seeds, counted from 0.
+        seeds: which.
         budget: factor on the number of iterations of every row.
         capture: that all are trained on.
         overrides: `section.key value` words for every row alike.
@@ -136,10 +137,13 @@ def plan_runs(
     Raises:
         ValueError: seeds or budget out of range, or the folder holds a run of other settings, or of other content of the capture.
     """
-    if seeds < 1 or budget <= 0:
-        raise ValueError(f"plan_runs(): expected seeds of at least 1 and a positive budget; got {seeds} and {budget:g}.")
+    if not seeds or seeds.start < 0 or budget <= 0:
+        raise ValueError(
+            "plan_runs(): expected one seed or more, counted from 0 or more, and a positive budget; got "
+            f"{len(seeds)}, {seeds.start} and {budget:g}."
+        )
     runs = []
-    for seed in range(seeds):
+    for seed in seeds:
         for row in rows:
             settings = resolve(row.preset, [*overrides, f"capture.path={capture.absolute()}", f"training.seed={seed}"])
             planned = PlannedRun(row, _scaled(settings, budget), folder / row.name / f"seed_{seed}", digest)
@@ -147,6 +151,14 @@ def plan_runs(
             _check_same_capture(planned)
             runs.append(planned)
     return runs
+
+
+def compared_settings(settings: Settings) -> dict[str, object]:
+    """Dotted key -> value, as JSON has it, of what must be the same for two runs to be comparable: every setting but the place of the
+    capture, and the variant, which says where a run is computed ("auto" is resolved when it begins)."""
+    sections = json.loads(json.dumps(dataclasses.asdict(settings)))
+    del sections["rendering"]["variant"], sections["capture"]["path"]
+    return {f"{section}.{name}": value for section, values in sections.items() for name, value in values.items()}
 
 
 def capture_digest(capture: Path) -> str | None:
@@ -210,7 +222,9 @@ def _check_same(planned: PlannedRun) -> None:
     saved = planned.path / "settings.yaml"
     if not saved.is_file():
         return
-    was, wanted = _compared(load_settings(saved)), _compared(planned.settings)
+    was, wanted = (
+        compared_settings(settings) | {"capture.path": settings.capture.path} for settings in (load_settings(saved), planned.settings)
+    )
     changed = [f"{key} {before} -> {wanted[key]}" for key, before in was.items() if before != wanted[key]]
     if changed:
         raise ValueError(
@@ -219,18 +233,13 @@ def _check_same(planned: PlannedRun) -> None:
         )
 
 
-def _compared(settings: Settings) -> dict[str, object]:
-    """Dotted key -> value of every setting, except the variant: it says where a run is computed, and "auto" is resolved when it begins."""
-    sections = dataclasses.asdict(settings)
-    del sections["rendering"]["variant"]
-    return {f"{section}.{name}": value for section, values in sections.items() for name, value in values.items()}
-
-
 def _check_same_capture(planned: PlannedRun) -> None:
     """The same path is not the same capture: it may have been filmed again. What older versions left has no digest, and is accepted."""
     now = planned.digest
     if now is None or not (planned.is_measured or planned.is_begun):
         return
+    if planned.is_measured and ADOPTED in planned.measures():
+        return  # told when it was adopted
     was = planned.measures().get("capture_digest") if planned.is_measured else planned.noted_digest()
     if was is not None and was != now:
         raise ValueError(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsuba_avatar.ablation.plan import PlannedRun
+from mitsuba_avatar.ablation.plan import PlannedRun, compared_settings
 from mitsuba_avatar.ablation.rows import Row
 from mitsuba_avatar.files import atomic_path
 
@@ -164,7 +164,7 @@ def write_tables(folder: Path, runs: Sequence[PlannedRun]) -> list[Entry]:
     """Write table.md, table.tex and table.json of all measured runs into a folder; returns the entries.
 
     The JSON lists every run: `name, seed, train, test` (see `driven_errors`), `seeds` (of its row that are measured), `minutes` (of its
-    training), `thousand_parameters`, and all that was measured.
+    training), `thousand_parameters`, `settings` (see `compared_settings`), and all that was measured.
     """
     entries = summarize(runs)
     seeds = {entry.row: entry.seeds for entry in entries}
@@ -178,7 +178,8 @@ def write_tables(folder: Path, runs: Sequence[PlannedRun]) -> list[Entry]:
                 "minutes": _scaled(measures, "training_seconds", 60),
                 "thousand_parameters": _scaled(measures, "parameters", 1000),
             }
-            rows.append({"name": run.row.name, "seed": measures["seed"], **errors, **costs, "measures": measures})
+            made = {"settings": compared_settings(run.settings), "measures": measures}
+            rows.append({"name": run.row.name, "seed": measures["seed"], **errors, **costs, **made})
     tables = "\n".join(text for text in (markdown(entries), takes_markdown(entries)) if text)
     texts = {"table.md": tables, "table.tex": latex(entries), "table.json": json.dumps(rows, indent=1) + "\n"}
     for name, text in texts.items():

@@ -12,7 +12,7 @@ from mitsuba_avatar.presets import resolve, save_settings
 
 
 def plan(folder: Path, *overrides: str, seeds: int = 2, budget: float = 0.5, digest: str | None = None) -> list[PlannedRun]:
-    return plan_runs(folder, choose_rows("ours,pose_face"), seeds, budget, Path("somewhere/capture"), list(overrides), digest)
+    return plan_runs(folder, choose_rows("ours,pose_face"), range(seeds), budget, Path("somewhere/capture"), list(overrides), digest)
 
 
 def begin(run: PlannedRun) -> None:
@@ -148,7 +148,7 @@ def test_the_digest_is_of_the_content_alone(capture: Path):
 
 @pytest.mark.parametrize(("seeds", "budget"), [(0, 1.0), (1, 0.0)])
 def test_nothing_to_train_is_refused(tmp_path: Path, seeds: int, budget: float):
-    with pytest.raises(ValueError, match="at least 1 and a positive budget"):
+    with pytest.raises(ValueError, match="one seed or more, counted from 0 or more, and a positive budget"):
         plan(tmp_path, seeds=seeds, budget=budget)
 
 
