@@ -145,6 +145,18 @@ class Avatar(nn.Module):
         """Registered vertices carried back to rest space, metres: what `encode` reads."""
         return unpose_vertices(vertices, self.skeleton(theta, root), self.skinning_weights)
 
+    def offset_maps(self, unposed_vertices: Float[Tensor, "P V 3"]) -> Float[Tensor, "P 3 E E"]:
+        """What the encoder reads: offsets from the template over the atlas, in units of `displacement_scale`; E = encoder_size.
+
+        It follows from a frame and the rig alone, so that training keeps it (training/offset_maps.py). Gradients: to the vertices.
+
+        Raises:
+            ValueError: if the avatar has no latent code.
+        """
+        if self.encoder_atlas is None:
+            raise ValueError("offset_maps(): expected an avatar with an encoder; model.use_latent is false. Decode with z = None.")
+        return self.encoder_atlas.texels_from_vertices((unposed_vertices - self.template_vertices) / self.settings.displacement_scale)
+
     def encode(self, unposed_vertices: Float[Tensor, "P V 3"]) -> Posterior:
         """Gaussian over the latent code of each pose.
 
@@ -158,12 +170,7 @@ class Avatar(nn.Module):
 
         Source: arXiv:2105.10441, section 3.2.
         """
-        if self.encoder is None or self.encoder_atlas is None:
-            raise ValueError("encode(): expected an avatar with an encoder; model.use_latent is false. Decode with z = None.")
-        offsets = (unposed_vertices - self.template_vertices) / self.settings.displacement_scale
-        texels = self.encoder_atlas.texels_from_vertices(offsets)
-        with self._networks():
-            return self.encoder(texels)
+        return self._posterior(self.offset_maps(unposed_vertices))
 
     def decode(
         self,
@@ -220,7 +227,7 @@ class Avatar(nn.Module):
 
     def forward(
         self,
-        registered_vertices: Float[Tensor, "P V 3"] | None,
+        offset_maps: Float[Tensor, "P 3 E E"] | None,
         theta: Float[Tensor, "P D"],
         root: Float[Tensor, "P 4 4"],
         face: Float[Tensor, "P F"],
@@ -231,7 +238,7 @@ class Avatar(nn.Module):
         """One training pass: encode the registered mesh, draw z = mu + std * noise, decode.
 
         Args:
-            registered_vertices: [P, V, 3] tracked mesh in the world, metres; not read without a latent code.
+            offset_maps: [P, 3, E, E] of the unposed registered mesh, see there; not read without a latent code.
             noise: [P, Z] standard normal numbers; None takes z = mu.
             theta, root, face, camera_centers, ambient_occlusion: as in `decode`.
 
@@ -239,21 +246,21 @@ class Avatar(nn.Module):
             What `decode` returns, and the posterior (None for an avatar without a latent code).
 
         Raises:
-            ValueError: as `decode`; also if an avatar with a latent code gets no registered mesh.
+            ValueError: as `decode`; also if an avatar with a latent code gets no offset maps.
         """
-        z, posterior = self._draw_latent(registered_vertices, theta, root, noise)
+        z, posterior = self._draw_latent(offset_maps, noise)
         return self.decode(theta, root, face, z, camera_centers, ambient_occlusion), posterior
 
     def reconstruct_surface(
         self,
-        registered_vertices: Float[Tensor, "P V 3"] | None,
+        offset_maps: Float[Tensor, "P 3 E E"] | None,
         theta: Float[Tensor, "P D"],
         root: Float[Tensor, "P 4 4"],
         face: Float[Tensor, "P F"],
         noise: Float[Tensor, "P Z"] | None,
     ) -> tuple[Float[Tensor, "P V 3"], Posterior | None]:
         """The posed surface and the posterior of `forward` alone, without cameras, occlusion or texture; arguments and errors as there."""
-        z, posterior = self._draw_latent(registered_vertices, theta, root, noise)
+        z, posterior = self._draw_latent(offset_maps, noise)
         return self.decode_vertices(theta, root, face, z), posterior
 
     @contextmanager
@@ -265,18 +272,21 @@ class Avatar(nn.Module):
         with torch.autocast(self.mean_texture.device.type, torch.bfloat16):
             yield
 
-    def _draw_latent(
-        self, registered_vertices: Tensor | None, theta: Tensor, root: Tensor, noise: Tensor | None
-    ) -> tuple[Tensor | None, Posterior | None]:
+    def _posterior(self, offset_maps: Tensor) -> Posterior:
+        """What the encoder says."""
+        with self._networks():
+            return self.encoder(offset_maps)
+
+    def _draw_latent(self, offset_maps: Tensor | None, noise: Tensor | None) -> tuple[Tensor | None, Posterior | None]:
         """Latent code of a training pass, and the posterior that it is from; nothing for an avatar without."""
         if not self.settings.use_latent:
             return None, None
-        if registered_vertices is None:
+        if offset_maps is None:
             raise ValueError(
-                "Avatar(): expected registered vertices to encode; got None. Train on a capture with vertices.npy, "
+                "Avatar(): expected offset maps of registered vertices to encode; got None. Train on a capture with vertices.npy, "
                 "or set model.use_latent false."
             )
-        posterior = self.encode(self.unpose(registered_vertices, theta, root))
+        posterior = self._posterior(offset_maps)
         return posterior.mu if noise is None else posterior.sample(noise), posterior
 
     def _displaced(self, displacement: Float[Tensor, "P 3 G G"]) -> Float[Tensor, "P V 3"]:

@@ -64,11 +64,25 @@ class StatisticsNetwork(nn.Module):
 
     def forward(self, z: Float[Tensor, "*#rows Z"], driving: Float[Tensor, "*#rows D"]) -> Float[Tensor, "*rows"]:
         """Scores of pairs, within +-LARGEST_SCORE; leading sizes are broadcast. Gradients: to everything."""
+        return self.score_pairs(self.read_latent(z), self.read_driving(driving))
+
+    def read_latent(self, z: Float[Tensor, "*rows Z"]) -> Float[Tensor, "*rows features"]:
+        """What a score needs of latent codes: hidden features, then embedding. Made once a row, however many pairs the row is in."""
         z = (z - self.latent_mean) / self.latent_std
+        return torch.cat([self.from_latent(z), self.latent_embedding(z)], dim=-1)
+
+    def read_driving(self, driving: Float[Tensor, "*rows D"]) -> Float[Tensor, "*rows features"]:
+        """What a score needs of driving signals: hidden features, then embedding."""
         driving = (driving - self.driving_mean) / self.driving_std
-        features = self.activation(self.from_latent(z) + self.from_driving(driving))
+        return torch.cat([self.from_driving(driving), self.driving_embedding(driving)], dim=-1)
+
+    def score_pairs(self, latent: Float[Tensor, "*#rows features"], driving: Float[Tensor, "*#rows features"]) -> Float[Tensor, "*rows"]:
+        """Scores of what was read, as `forward`."""
+        from_latent, latent_embedding = latent.chunk(2, dim=-1)
+        from_driving, driving_embedding = driving.chunk(2, dim=-1)
+        features = self.activation(from_latent + from_driving)
         score = self.score(self.activation(self.hidden(features)))[..., 0]
-        score = score + (self.latent_embedding(z) * self.driving_embedding(driving)).sum(-1) / math.sqrt(self.score.in_features)
+        score = score + (latent_embedding * driving_embedding).sum(-1) / math.sqrt(self.score.in_features)
         return LARGEST_SCORE * torch.tanh(score / LARGEST_SCORE)
 
 
@@ -101,8 +115,8 @@ def mismatched(driving: Float[Tensor, "N D"], count: int, generator: torch.Gener
         count: S.
         generator: on the CPU.
     """
-    shifts = torch.randint(1, len(driving), (count, 1), generator=generator)
-    return driving[((torch.arange(len(driving)) + shifts) % len(driving)).to(driving.device)]
+    shifts = torch.randint(1, len(driving), (count,), generator=generator)
+    return torch.stack([driving.roll(-shift, 0) for shift in shifts.tolist()])
 
 
 def mutual_information_bound(joint: Float[Tensor, "*rows"], product: Float[Tensor, "*pairs"]) -> Float[Tensor, ""]:

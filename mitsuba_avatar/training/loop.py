@@ -35,6 +35,7 @@ from mitsuba_avatar.training.distributed import Process
 from mitsuba_avatar.training.divergence import DivergedError, DivergenceGuard, SkippedStep
 from mitsuba_avatar.training.losses import LATENT_TERMS, LossInputs, evaluate_losses, loss_weights, weighted_sum
 from mitsuba_avatar.training.mutual_information import MutualInformation
+from mitsuba_avatar.training.offset_maps import OffsetMaps
 from mitsuba_avatar.training.precision import is_mixed
 
 SEED_STRIDE = 1 << 20  # renderer seeds of different ranks and runs stay apart for a million iterations
@@ -88,6 +89,7 @@ class Trainer:
         self.laplacian = Laplacian(rig.topology).to(self.device)
         self.optimizer = torch.optim.Adam(avatar.parameters(), lr=training.learning_rate, fused=True)
         self.sampler = training_sampler(reader.capture, training, process)
+        self.offset_maps = OffsetMaps(avatar) if settings.model.use_latent else None
         self.information, self.keypoints = self._disentanglement(rig)
         self.response = CameraResponse.of(reader.capture, settings)
         if self.response is not None:
@@ -274,7 +276,7 @@ class Trainer:
         settings = self.settings
         with self.timer.part("decoder"):
             output, posterior = self.model(
-                batch.vertices, batch.theta, batch.root, batch.face, batch.camera_centers, batch.ambient_occlusion, noise
+                self._offset_maps(batch), batch.theta, batch.root, batch.face, batch.camera_centers, batch.ambient_occlusion, noise
             )
         self._require_finite("surface", {"vertices": output.vertices.detach().abs().sum()}, batch)
         with self.timer.part("render"):
@@ -297,9 +299,13 @@ class Trainer:
     def _surface_alone(self, batch: FrameBatch, noise: Tensor) -> LossInputs:
         """The same without pictures, for settings that do not look at them: a rehearsal on geometry takes a fraction of the time."""
         with self.timer.part("decoder"):
-            vertices, posterior = self.avatar.reconstruct_surface(batch.vertices, batch.theta, batch.root, batch.face, noise)
+            vertices, posterior = self.avatar.reconstruct_surface(self._offset_maps(batch), batch.theta, batch.root, batch.face, noise)
         self._require_finite("surface", {"vertices": vertices.detach().abs().sum()}, batch)
         return LossInputs(vertices=vertices, tracked_vertices=batch.vertices, posterior=posterior, laplacian=self.laplacian)
+
+    def _offset_maps(self, batch: FrameBatch) -> Tensor | None:
+        """What the encoder reads; None for an avatar without."""
+        return None if self.offset_maps is None else self.offset_maps.of(batch)
 
     def _with_disentanglement(self, inputs: LossInputs, batch: FrameBatch, latents: Tensor | None) -> LossInputs:
         """Inputs with the parts of the disentangling terms, where they are asked for."""

@@ -158,8 +158,9 @@ class MutualInformation:
         """One step of the statistics network up the bound."""
         rows = self._draw(stream)
         z, driving = self._sample(Posterior(self.mu[rows], self.logvar[rows]), stream), self.driving[rows]
-        joint = self.network(z, driving)
-        product = self.network(z[None], mismatched(driving, MISMATCHES, self._generator(MISMATCH_STREAMS + stream)))
+        latent, driving = self.network.read_latent(z), self.network.read_driving(driving)
+        joint = self.network.score_pairs(latent, driving)
+        product = self.network.score_pairs(latent[None], mismatched(driving, MISMATCHES, self._generator(MISMATCH_STREAMS + stream)))
         rate = self.settings.moving_average
         self.mean_exp = (1 - rate) * self.mean_exp + rate * float(product.detach().exp().mean())
         loss = DRIFT_WEIGHT * log_mean_exp(product).square() - corrected_objective(joint, product, self.mean_exp)

@@ -121,8 +121,8 @@ def test_without_latent_code_there_is_no_encoder(make_avatar, drive):
     output, posterior = avatar(None, **drive, noise=None)
     assert posterior is None
     assert output.textures.shape == (2, 3, 3, 64, 64)
-    with pytest.raises(ValueError, match=r"encode\(\): expected an avatar with an encoder"):
-        avatar.encode(output.rest_vertices)
+    with pytest.raises(ValueError, match=r"offset_maps\(\): expected an avatar with an encoder"):
+        avatar.offset_maps(output.rest_vertices)
     with pytest.raises(ValueError, match="expected z = None"):
         avatar.decode(**drive, z=torch.zeros(2, 16))
 
@@ -182,20 +182,23 @@ def test_the_encoder_sees_the_unposed_offset_from_the_template(make_avatar, driv
 def test_training_pass_is_unpose_encode_sample_decode(make_avatar, drive):
     avatar, noise = make_avatar(), torch.randn(2, 16)
     registered = avatar.pose_template(drive["theta"], drive["root"]) + 0.01 * torch.randn(2, len(avatar.template_vertices), 3)
-    output, posterior = avatar(registered, **drive, noise=noise)
-    expected = avatar.encode(avatar.unpose(registered, drive["theta"], drive["root"]))
+    unposed = avatar.unpose(registered, drive["theta"], drive["root"])
+    maps = avatar.offset_maps(unposed)
+    output, posterior = avatar(maps, **drive, noise=noise)
+    expected = avatar.encode(unposed)
     z = expected.mu + torch.exp(0.5 * expected.logvar) * noise
     assert torch.equal(posterior.logvar, expected.logvar)
     torch.testing.assert_close(output.textures, avatar.decode(**drive, z=z).textures)
-    assert torch.equal(avatar(registered, **drive, noise=None)[0].vertices, avatar.decode(**drive, z=expected.mu).vertices)
-    with pytest.raises(ValueError, match="expected registered vertices to encode; got None"):
+    assert torch.equal(avatar(maps, **drive, noise=None)[0].vertices, avatar.decode(**drive, z=expected.mu).vertices)
+    with pytest.raises(ValueError, match="expected offset maps of registered vertices to encode; got None"):
         avatar(None, **drive, noise=noise)
 
 
 def test_every_parameter_gets_a_gradient(make_avatar, drive):
     avatar = make_avatar()
     registered = avatar.pose_template(drive["theta"], drive["root"]) + 0.01 * torch.randn(2, len(avatar.template_vertices), 3)
-    output, _ = avatar(registered, **drive, noise=torch.randn(2, 16))
+    maps = avatar.offset_maps(avatar.unpose(registered, drive["theta"], drive["root"]))
+    output, _ = avatar(maps, **drive, noise=torch.randn(2, 16))
     (output.textures.square().sum() + output.vertices.square().sum()).backward()
     assert [name for name, parameter in avatar.named_parameters() if parameter.grad is None or not parameter.grad.any()] == []
 
@@ -254,7 +257,9 @@ def test_the_papers_full_size_decodes_with_the_right_shapes(rig, drive):
     settings = resolve("paper").model
     avatar = Avatar(rig, settings, DrivingStatistics.neutral(rig, 6, 1024)).to("meta")  # shapes without the arithmetic
     arguments = {name: value.to("meta") for name, value in drive.items()} | {"ambient_occlusion": torch.ones(2, 1, 256, 256, device="meta")}
-    output, posterior = avatar(torch.ones(2, 258, 3, device="meta"), **arguments, noise=torch.ones(2, 512, device="meta"))
+    output, posterior = avatar(
+        torch.ones(2, 3, settings.encoder_size, settings.encoder_size, device="meta"), **arguments, noise=torch.ones(2, 512, device="meta")
+    )
     assert output.textures.shape == (2, 3, 3, 1024, 1024)
     assert output.gain.shape == (2, 1, 256, 256)
     assert output.vertices.shape == (2, 258, 3)
