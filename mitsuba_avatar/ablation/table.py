@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsuba_avatar.ablation.measure_tables import measures_markdown
 from mitsuba_avatar.ablation.plan import PlannedRun, compared_settings
 from mitsuba_avatar.ablation.rows import Row
+from mitsuba_avatar.ablation.spread import Spread
 from mitsuba_avatar.files import atomic_path
 
 LATENT_FIGURES = ("kl_nats", "active_entries", "frame_information_nats", "mutual_information_nats")  # of a run's measures
@@ -21,23 +23,6 @@ PAPER_HEADINGS = ("paper train", "paper test")
 HEADINGS = ("model", "train", "validation", "test", "over ours", "gap", *LATENT_HEADINGS, *PAPER_HEADINGS)
 COST_HEADINGS = ("seeds", "minutes", "thousand parameters")  # before the paper's, in Markdown alone: the LaTeX is wide enough
 REFERENCE = "ours"  # row that the others are compared with, seed by seed
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Mean over seeds, and the standard deviation between them; None where there is one seed."""
-
-    mean: float
-    deviation: float | None
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Spread":
-        """Of one number a seed."""
-        return cls(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None)
-
-    def text(self, between: str = " ± ", decimals: int = 2) -> str:
-        """As people write it."""
-        return f"{self.mean:.{decimals}f}" + ("" if self.deviation is None else f"{between}{self.deviation:.{decimals}f}")
 
 
 @dataclass(frozen=True)
@@ -180,7 +165,7 @@ def write_tables(folder: Path, runs: Sequence[PlannedRun]) -> list[Entry]:
             }
             made = {"settings": compared_settings(run.settings), "measures": measures}
             rows.append({"name": run.row.name, "seed": measures["seed"], **errors, **costs, **made})
-    tables = "\n".join(text for text in (markdown(entries), takes_markdown(entries)) if text)
+    tables = "\n".join(text for text in (markdown(entries), takes_markdown(entries), measures_markdown(runs)) if text)
     texts = {"table.md": tables, "table.tex": latex(entries), "table.json": json.dumps(rows, indent=1) + "\n"}
     for name, text in texts.items():
         with atomic_path(folder / name) as temporary:
