@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mitsuba_avatar.ablation.plan import ADOPTED, PlannedRun, compared_settings
 from mitsuba_avatar.presets import save_settings
+from mitsuba_avatar.settings import Settings
 
 
 def adopt(runs: list[PlannedRun], table: Path) -> list[PlannedRun]:
@@ -29,16 +30,13 @@ def adopt(runs: list[PlannedRun], table: Path) -> list[PlannedRun]:
         FileNotFoundError, ValueError: no such table, no table, or a run in it was made with other settings than planned.
     """
     rows = {(row["name"], row["seed"]): row for row in _rows(table)}
-    adopted = []
-    for run in runs:
-        row = rows.get((run.row.name, run.settings.training.seed))
-        if row is None or run.is_begun or run.is_measured:
-            continue
-        _check_made_alike(run, row, table)
+    adopted = [run for run in runs if (run.row.name, run.settings.training.seed) in rows and not run.is_begun and not run.is_measured]
+    for run in adopted:  # all, before any is written
+        _check_made_alike(run, rows[run.row.name, run.settings.training.seed], table)
+    for run in adopted:
         run.path.mkdir(parents=True, exist_ok=True)
         save_settings(run.path / "settings.yaml", run.settings)
-        run.save_measures(row["measures"] | {ADOPTED: str(table)})
-        adopted.append(run)
+        run.save_measures(rows[run.row.name, run.settings.training.seed]["measures"] | {ADOPTED: str(table)})
     others = sorted({digest[:12] for digest in (run.measures().get("capture_digest") for run in adopted) if digest})
     here = next((run.digest for run in adopted if run.digest), None)
     if here is not None and others != [here[:12]]:
@@ -65,14 +63,14 @@ def _rows(table: Path) -> list[dict]:
 
 
 def _check_made_alike(run: PlannedRun, row: dict, table: Path) -> None:
-    """A table of runs that were not made alike would prove nothing."""
-    planned, was = compared_settings(run.settings), row.get("settings")
-    if was is None:
+    """A table of runs that were not made alike would prove nothing. A setting that is younger than the table had its default then."""
+    if row.get("settings") is None:
         raise ValueError(
             f"adopt(): expected the settings of {row['name']}, seed {row['seed']}, in {table}; got none, as older versions wrote it. "
             "Train it again."
         )
-    changed = [f"{key} {was.get(key)} -> {value}" for key, value in planned.items() if was.get(key) != value]
+    was = compared_settings(Settings()) | row["settings"]
+    changed = [f"{key} {was[key]} -> {value}" for key, value in compared_settings(run.settings).items() if was[key] != value]
     if changed:
         raise ValueError(
             f"adopt(): expected {row['name']}, seed {row['seed']}, of {table} to be of the same settings; got {', '.join(changed)}. "

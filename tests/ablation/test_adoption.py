@@ -74,6 +74,16 @@ def test_runs_of_other_settings_are_refused_before_and_after(table: Path, tmp_pa
         plan(tmp_path / "here", "loss.kl=0.5")
 
 
+def test_a_setting_younger_than_the_table_had_its_default(table: Path, tmp_path: Path):
+    rows = json.loads(table.read_text())
+    for row in rows:
+        del row["settings"]["training.precision"], row["settings"]["training.gradient_clip"]
+    table.write_text(json.dumps(rows))
+    assert len(adopt(plan(tmp_path / "here", "training.precision=float32"), table)) == 2
+    with pytest.raises(ValueError, match="got training.precision float32 -> auto"):
+        adopt(plan(tmp_path / "elsewhere"), table)
+
+
 def test_a_table_that_is_none_or_does_not_tell_its_settings_is_refused(table: Path, tmp_path: Path):
     runs = plan(tmp_path / "here")
     with pytest.raises(FileNotFoundError, match="there is no .*nowhere.json. Correct --measured"):

@@ -29,6 +29,11 @@ def test_an_unknown_precision_is_refused():
         dataclasses.replace(TrainingSettings(), precision="half")
 
 
-def test_what_a_cpu_can_do_is_asked_of_torch():
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()
-    assert precision.multiplies_bfloat16(CPU) == bool(capabilities.get("amx_bf16"))
+@pytest.mark.parametrize(
+    ("capabilities", "expected"), [({"amx_bf16": True}, True), ({"amx_bf16": False, "avx512_bf16": True}, False), ({}, False)]
+)
+def test_a_cpu_needs_amx(capabilities: dict[str, bool], expected: bool, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
+    assert precision.multiplies_bfloat16(CPU) == expected
+    monkeypatch.delattr(torch.cpu, "get_capabilities")
+    assert not precision.multiplies_bfloat16(CPU), "a torch that cannot tell stays in float32"
