@@ -33,6 +33,12 @@ class Column:
         return "-" if None in values else Spread.of(values).text(decimals=self.decimals)
 
 
+MEAN_CODE = (
+    Column("train", ("images_mean_code", "train", "mse"), 2),
+    Column("validation", ("images_mean_code", "validation", "mse"), 2),
+    Column("test", ("images_mean_code", "test", "mse"), 2),
+    Column("nats of the offset", ("disentanglement", "offset_nats"), 1),
+)
 SHADING = (
     Column("train: slope", ("shading", "train", "slope"), 2),
     Column("test: slope", ("shading", "test", "slope"), 2),
@@ -62,7 +68,7 @@ GEOMETRY = (
     Column("test: driven", ("geometry", "test", "driven_mm"), 2),
     Column("clothes: driven", ("geometry", "test", "driven_garment_mm"), 2),
 )
-TITLES = {"Shading": SHADING, "Disentanglement": DISENTANGLEMENT, "Geometry": GEOMETRY}
+TITLES = {"Driven with the mean code": MEAN_CODE, "Shading": SHADING, "Disentanglement": DISENTANGLEMENT, "Geometry": GEOMETRY}
 
 
 def measures_markdown(runs: Sequence[PlannedRun]) -> str:

@@ -59,15 +59,19 @@ def _work(run: PlannedRun) -> int:
     digest = run.noted_digest()
     if digest is not None:
         measures["capture_digest"] = digest
+    study = None if fit.capture.vertices is None else Study.of(avatar, fit.run.rig, fit.capture)
     if run.settings.loss.looks_at_images:
         samples = run.settings.evaluation.samples_per_pixel
         renderer = SurfaceRenderer(fit.run.rig.topology, fit.reader.width, fit.reader.height, samples)
         evaluator, splits = Evaluator(avatar, fit.reader, renderer), Splits.of(fit.capture, most)
         with progress_bar("measuring pictures", sum(map(len, splits.frames.values()))) as bar:
             measures["images"] = image_errors(evaluator, splits, bar.update)
+        mean_code = None if study is None else study.mean_code()
+        if mean_code is not None:
+            with progress_bar("with the mean code", sum(map(len, splits.frames.values()))) as bar:
+                measures["images_mean_code"] = image_errors(evaluator, splits, bar.update, mean_code)
         measures["shading"] = shading_errors(evaluator, {name: splits.frames[name] for name in ("train", "test") if name in splits.frames})
-    if fit.capture.vertices is not None:
-        study = Study.of(avatar, fit.run.rig, fit.capture)
+    if study is not None:
         measures["geometry"] = geometry_errors(study, most)
         measures["disentanglement"] = disentanglement(study, run.settings.training.seed)
     run.save_measures(measures)

@@ -60,8 +60,16 @@ class Splits:
         return cls({name: evenly_spaced(frames, most) for name, frames in groups.items() if frames})
 
 
-def image_errors(evaluator: Evaluator, splits: Splits, progress: Progress = lambda done, total: None) -> dict[str, dict[str, Any]]:
-    """Split -> errors of the avatar driven with z = 0, over all cameras and over held-out cameras alone.
+def image_errors(
+    evaluator: Evaluator, splits: Splits, progress: Progress = lambda done, total: None, z: Float[Tensor, "1 Z"] | None = None
+) -> dict[str, dict[str, Any]]:
+    """Split -> errors of the driven avatar, over all cameras and over held-out cameras alone.
+
+    Args:
+        evaluator: of the avatar.
+        splits: frames that are drawn.
+        progress: called as progress(done, total), in frames.
+        z: latent code of all frames; None for z = 0.
 
     Returns:
         for each split `mse`, `l1` (0..255), `psnr` (of the mean error, dB), `iou`, `held_out_mse`, `pictures`, how many were counted, and
@@ -75,7 +83,7 @@ def image_errors(evaluator: Evaluator, splits: Splits, progress: Progress = lamb
         rows, takes = [], []
         for frame in frames:
             batch = evaluator.reader.read([frame], [names])
-            drawn = evaluator.draw("avatar", batch)
+            drawn = evaluator.draw("avatar", batch, z)
             images, masks = (batch.pictures(values) for values in (drawn.images, batch.images)), (drawn.masks, batch.masks)
             pictures = zip(names, *images, *(batch.coverage(values) for values in masks), strict=True)
             for name, image, captured, mask, inside in pictures:
@@ -152,6 +160,10 @@ class Study:
         """Theta, root and face of a frame."""
         rows = slice(frame, frame + 1)
         return self.drive.theta[rows], self.drive.root[rows], self.drive.face[rows]
+
+    def mean_code(self) -> Float[Tensor, "1 Z"] | None:
+        """Mean of the training frames' posterior means; None for an avatar without a latent code."""
+        return None if self.posterior is None else self.posterior.mu[self.frames("train")].mean(0, keepdim=True)
 
     def keypoints(self) -> DrivenKeypoints:
         """What the driving signal fixes."""

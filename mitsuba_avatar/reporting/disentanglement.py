@@ -45,11 +45,14 @@ class LatentUse:
         frame_information_nats: mutual information between a drawn z and *which* of the frames it is of. An upper bound on what z tells of
             anything about these frames, their driving signals included; at most the logarithm of their number.
         active_entries: entries whose posterior mean varies between frames.
+        offset_nats: part of the divergence that is paid because the mean of all posterior means is not zero. It tells nothing, and z = 0
+            is as far from the codes as that mean is.
     """
 
     kl_nats: float
     frame_information_nats: float
     active_entries: int
+    offset_nats: float
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ def latent_use(posterior: Posterior, seed: int = 0) -> LatentUse:
     mu, logvar = posterior.mu.double(), posterior.logvar.double()
     nats = Posterior(mu, logvar).divergence().mean()
     active = (mu.var(0, correction=0) > ACTIVE_VARIANCE).sum()
-    return LatentUse(float(nats), _frame_information(mu, logvar, seed), int(active))
+    offset = mu.mean(0).square().sum() / 2
+    return LatentUse(float(nats), _frame_information(mu, logvar, seed), int(active), float(offset))
 
 
 def fresh_mutual_information(

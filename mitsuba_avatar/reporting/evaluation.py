@@ -81,14 +81,21 @@ class Evaluator:
         self._seams: SeamSampler | None = None
 
     @torch.no_grad()
-    def draw(self, method: str, batch: FrameBatch) -> Drawn:
-        """Draw a batch of one pose with a method of METHODS; what comes back lies in the host's memory."""
+    def draw(self, method: str, batch: FrameBatch, z: Float[Tensor, "1 Z"] | None = None) -> Drawn:
+        """Draw a batch of one pose with a method of METHODS; what comes back lies in the host's memory.
+
+        Args:
+            method: of METHODS.
+            batch: of one pose.
+            z: the avatar's latent code; None for z = 0.
+        """
         if method == "nearest_frame":
             return self._draw_nearest(batch)
         avatar = self.avatar
         batch = batch.to(avatar.mean_texture.device)
         if method == "avatar":
-            output = avatar.decode(batch.theta, batch.root, batch.face, None, batch.camera_centers, batch.ambient_occlusion)
+            z = None if z is None else z.to(avatar.mean_texture.device)
+            output = avatar.decode(batch.theta, batch.root, batch.face, z, batch.camera_centers, batch.ambient_occlusion)
             vertices, textures = output.vertices, output.textures[0]
         else:
             vertices = avatar.pose_template(batch.theta, batch.root)

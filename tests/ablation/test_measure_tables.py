@@ -31,3 +31,14 @@ def test_figures_are_means_over_seeds_and_what_was_not_measured_is_a_dash(tmp_pa
     ours, pose_face = disentanglement.strip().splitlines()[-2:]
     assert ours.startswith("| ours | 0.50 ± 0.00 | - | 3.0 ± 0.0 | - |") and set(pose_face) == set("| pose+face -")
     assert measures_markdown(runs[3:]) == ""
+
+
+def test_errors_with_the_mean_code_stand_beside_what_its_offset_costs(tmp_path: Path):
+    errors = {"train": {"mse": 42.6}, "test": {"mse": 58.2}}
+    runs = [
+        measured(tmp_path, "ours", 0, images_mean_code=errors, disentanglement={"offset_nats": 3.43}),
+        measured(tmp_path, "pose_face", 0, images={"train": {"mse": 53.0}}),
+    ]
+    lines = measures_markdown(runs).strip().splitlines()
+    assert lines[0] == "## Driven with the mean code"
+    assert lines[-2:] == ["| ours | 42.60 | - | 58.20 | 3.4 |", "| pose+face | - | - | - | - |"]

@@ -60,6 +60,28 @@ def test_image_errors_are_those_of_the_evaluation(loaded: LoadedRun):
     assert errors["psnr"] == pytest.approx(psnr_from_mse(mse)) and errors["pictures"] == 10
 
 
+def test_pictures_are_drawn_with_the_latent_code_that_is_given(loaded: LoadedRun, monkeypatch: pytest.MonkeyPatch):
+    evaluator, splits, given = loaded.evaluator(), Splits({"test": [8, 9]}), []
+    decode = loaded.avatar.decode
+
+    def noting(theta, root, face, z, *others):
+        given.append(z)
+        return decode(theta, root, face, z, *others)
+
+    monkeypatch.setattr(loaded.avatar, "decode", noting)
+    size = loaded.avatar.settings.latent_size
+    zero = image_errors(evaluator, splits)["test"]["mse"]
+    same, other = (image_errors(evaluator, splits, z=torch.full((1, size), value))["test"]["mse"] for value in (0.0, 3.0))
+    assert same == zero and abs(other / zero - 1) > 1e-4
+    assert given[:2] == [None, None] and all(float(z.mean()) == 3 for z in given[-2:])
+
+
+def test_the_mean_code_is_of_training_frames_alone(constructed: Study):
+    train = torch.tensor(ROWS["train"])
+    torch.testing.assert_close(constructed.mean_code(), constructed.posterior.mu[train].mean(0)[None])
+    assert dataclasses.replace(constructed, posterior=None).mean_code() is None
+
+
 def test_image_errors_of_a_split_are_the_mean_of_its_takes(loaded: LoadedRun):
     """Two frames of one take and one of another, five cameras each."""
     evaluator = loaded.evaluator()

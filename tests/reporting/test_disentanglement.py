@@ -108,6 +108,10 @@ def test_latent_use_by_hand():
     use = latent_use(Posterior(mu, logvar))
     assert use.active_entries == 1
     assert use.kl_nats == pytest.approx(0.5 + 0.5 * (0.25 - 1 + math.log(4)))
+    assert use.offset_nats == 0
+    mu[:, 0], mu[:, 1] = 0.6, mu[:, 1] - 0.8
+    shifted = latent_use(Posterior(mu, logvar))
+    assert shifted.offset_nats == pytest.approx(0.5) and shifted.kl_nats == pytest.approx(use.kl_nats + 0.5)
 
 
 def test_codes_that_tell_frames_apart_with_certainty_carry_the_logarithm_of_their_number():
