@@ -4,6 +4,7 @@ The built rig and the embedded capture are cached (`mitsuba_avatar.files.cache_f
 session builds the rig and later ones reuse it. Set MITSUBA_AVATAR_CACHE to an empty folder to test from nothing.
 """
 
+import signal
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,6 +31,14 @@ SHORT_FIT = (
     *("training.iterations=40", "training.learning_rate=5e-3", "training.checkpoint_every=20", "training.validate_every=20"),
     *("training.preview_every=40", "evaluation.frames_per_split=2", "evaluation.orbit_frames=3", "evaluation.samples_per_pixel=4"),
 )
+
+
+@pytest.fixture(autouse=True, scope="session")
+def heeded_ctrl_c():
+    """SIGINT raises KeyboardInterrupt, as in a terminal, here and in child processes: a shell starts background jobs with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

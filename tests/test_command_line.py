@@ -3,6 +3,7 @@
 import ast
 import os
 import signal
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,7 +59,8 @@ def test_a_command_that_is_ended_says_in_one_line_what_is_kept(number, capsys):
     def main(arguments=None):
         try:
             os.kill(os.getpid(), number)
-            signal.pause()
+            time.sleep(30)
+            pytest.fail("expected the signal to end the sleep; nothing did.")
         finally:
             unwound.append(arguments)
 
