@@ -68,7 +68,7 @@ def _work(run: PlannedRun) -> int:
             measures["images"] = image_errors(evaluator, splits, bar.update)
         mean_code = None if study is None else study.mean_code()
         if mean_code is not None:
-            with progress_bar("with the mean code", sum(map(len, splits.frames.values()))) as bar:
+            with progress_bar("measuring pictures with the mean code", sum(map(len, splits.frames.values()))) as bar:
                 measures["images_mean_code"] = image_errors(evaluator, splits, bar.update, mean_code)
         measures["shading"] = shading_errors(evaluator, {name: splits.frames[name] for name in ("train", "test") if name in splits.frames})
     if study is not None:

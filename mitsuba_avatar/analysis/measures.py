@@ -162,7 +162,8 @@ class Study:
         return self.drive.theta[rows], self.drive.root[rows], self.drive.face[rows]
 
     def mean_code(self) -> Float[Tensor, "1 Z"] | None:
-        """Mean of the training frames' posterior means; None for an avatar without a latent code."""
+        """Mean of the training frames' posterior means, the code of the imputation `mean` (driving/imputation.py); None for an avatar
+        without a latent code."""
         return None if self.posterior is None else self.posterior.mu[self.frames("train")].mean(0, keepdim=True)
 
     def keypoints(self) -> DrivenKeypoints:

@@ -87,7 +87,10 @@ class Evaluator:
         Args:
             method: of METHODS.
             batch: of one pose.
-            z: the avatar's latent code; None for z = 0.
+            z: the latent code of the method "avatar"; None for z = 0. Other methods have none.
+
+        Raises:
+            ValueError: a code is given to an avatar that has none.
         """
         if method == "nearest_frame":
             return self._draw_nearest(batch)
